@@ -1,0 +1,36 @@
+"""The command line: the only place that parses arguments and prints."""
+
+import sys
+
+import typer
+
+from cconv.cli.console import errors
+from cconv.cli.data import app as data_app
+from cconv.cli.model import evaluate, report, train
+from cconv.cli.study import app as study_app
+from cconv.errors import CConvError
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="cconv",
+    help="Find the smallest, fastest continuous-convolution network that is accurate and stable enough for your fluid.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.add_typer(data_app, name="data")
+app.add_typer(study_app, name="study")
+for command in (train, evaluate, report):
+    app.command()(command)
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one line on stderr and exit status 2."""
+    try:
+        app()
+    except CConvError as error:
+        errors.print(f"cconv: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,197 @@
+"""`cconv data`: make, look at and convert particle data."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from cconv.cli.console import print_json, results, show_progress
+from cconv.errors import ConfigError
+
+# Commands import what they run inside, as torch takes seconds to load and `--help` should not.
+
+app = typer.Typer(help="Make, look at and convert particle data.", no_args_is_help=True)
+generate = typer.Typer(help="Make a data set of a scene, e.g. to try the rest of `cconv` on.", no_args_is_help=True)
+app.add_typer(generate, name="generate")
+
+DataFolder = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PATH",
+        help="Folder of the data: LagrangeBench (train.h5, valid.h5, test.h5, metadata.json) or "
+        "DeepLagrangianFluids (*.msgpack.zst).",
+    ),
+]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write; it appears when all is done.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an older data set in the folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of a table.")]
+Mass = Annotated[
+    float | None,
+    typer.Option(help="Mass of every particle, where the data hold none or wrong ones (DeepLagrangianFluids: 0.125)."),
+]
+Spacing = Annotated[
+    float | None,
+    typer.Option(help="Distance of neighbouring particles at rest; smoothing lengths scale with it."),
+]
+FrameDt = Annotated[
+    float | None, typer.Option(help="Time between stored frames, where the data do not say it or say it wrong.")
+]
+Force = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y[,Z]", help="Constant external acceleration, e.g. gravity: '0,-9.81,0'. Few data sets store it."
+    ),
+]
+
+
+@generate.command("taylor_green_2d")
+def generate_taylor_green_2d(
+    out: OutFolder,
+    trajectories: Annotated[
+        int, typer.Option(help="How many simulations; split by simulation into train, valid and test.")
+    ] = 8,
+    frames: Annotated[int, typer.Option(help="Frames of each simulation.")] = 40,
+    particles_per_side: Annotated[
+        int, typer.Option(help="Particles along an axis of the box; the square of it is their number.")
+    ] = 30,
+    seed: Annotated[int, typer.Option(help="Seed; the same seed gives the same bytes.")] = 0,
+    viscosity: Annotated[float, typer.Option(help="Kinematic viscosity; the Reynolds number is its inverse.")] = 0.01,
+    frame_dt: Annotated[
+        float, typer.Option(help="Time between frames; 40 frames of 0.01 keep the particles evenly spread.")
+    ] = 0.01,
+    overwrite: Overwrite = False,
+) -> None:
+    """Particles in decaying Taylor-Green vortices, 2D, periodic.
+
+    The flow is known exactly, so velocities are exact and generation takes seconds. Simulations differ in where the
+    vortices stand and how the particles start.
+    """
+    from cconv.data.generate import generate_taylor_green_2d as run
+
+    run(
+        out,
+        num_trajectories=trajectories,
+        num_frames=frames,
+        particles_per_side=particles_per_side,
+        seed=seed,
+        viscosity=viscosity,
+        frame_dt=frame_dt,
+        overwrite=overwrite,
+        progress=show_progress,
+    )
+    results.print(f"{trajectories} trajectories of {frames} frames, {particles_per_side**2} particles: {out}")
+
+
+@app.command()
+def inspect(
+    path: DataFolder,
+    as_json: AsJson = False,
+    cutoff: Annotated[
+        float | None, typer.Option(help="Radius within which neighbours are counted; twice the spacing if not given.")
+    ] = None,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+) -> None:
+    """Show what a data set holds, what it lacks, and what was taken instead.
+
+    Every trajectory is read, so damaged files and exploded simulations are found here.
+    """
+    from cconv.data.inspect import inspect_dataset
+
+    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    facts = inspect_dataset(dataset, cutoff, show_progress)
+    if as_json:
+        print_json(facts)
+    else:
+        results.print(_table(facts))
+
+
+@app.command()
+def convert(
+    path: DataFolder,
+    out: OutFolder,
+    overwrite: Overwrite = False,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+) -> None:
+    """Write a data set as LagrangeBench HDF5, with velocities, masses and wall points as extra members.
+
+    Splits become files. What is given here is stored, so it need not be given again.
+    """
+    from cconv.data.convert import convert as run
+
+    run(_open(path, mass, particle_spacing, frame_dt, force), out, overwrite, show_progress)
+    results.print(f"{path} as LagrangeBench HDF5: {out}")
+
+
+def parse_vector(text: str) -> tuple[float, ...]:
+    """Numbers separated by commas.
+
+    Raises:
+        ConfigError: If one is not a number.
+    """
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ConfigError(f"`--force` must be numbers separated by commas, such as 0,-9.81,0, got {text!r}.") from error
+
+
+def _open(path: Path, mass, particle_spacing, frame_dt, force: str | None):
+    from cconv.data.dataset import open_dataset
+
+    return open_dataset(
+        path,
+        mass=mass,
+        particle_spacing=particle_spacing,
+        frame_dt=frame_dt,
+        force=None if force is None else parse_vector(force),
+    )
+
+
+def _table(facts: dict) -> Table:
+    table = Table(title=facts["path"], show_header=False, title_justify="left")
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for label, text in _rows(facts):
+        table.add_row(label, text)
+    return table
+
+
+def _rows(facts: dict) -> list[tuple[str, str]]:
+    box, boundary, neighbors = facts["box"], facts["boundary"], facts["neighbors"]
+    axes = ["x", "y", "z"][: facts["dim"]]
+    periodic = [axis for axis, is_periodic in zip(axes, box["periodic"], strict=True) if is_periodic]
+    bounds = (f"{axis} {low:g} to {high:g}" for axis, low, high in zip(axes, box["lower"], box["upper"], strict=True))
+    normals = "with normals" if boundary["normals"] else "without normals"
+    return [
+        ("scene", f"{facts['name']} ({facts['format']})"),
+        *((f"{split} split", _split_text(counts)) for split, counts in facts["splits"].items()),
+        *((f"{kind.replace('_', ' ')} particles", _range_text(counts)) for kind, counts in facts["particles"].items()),
+        ("dimensions", str(facts["dim"])),
+        ("particle spacing", f"{facts['particle_spacing']:g}"),
+        ("time between frames", f"{facts['frame_dt']:.6g}"),
+        ("box", ", ".join(bounds)),
+        ("periodic axes", ", ".join(periodic) or "none"),
+        ("boundary points", f"{_range_text(boundary['points'])} {normals}" if boundary["points"]["max"] else "none"),
+        ("force", "none known" if facts["force"] is None else ", ".join(f"{value:g}" for value in facts["force"])),
+        ("velocities", facts["velocity_source"]),
+        ("masses", f"{facts['mass_source']} ({_range_text(facts['mass'])})"),
+        ("speed", f"mean {facts['speed']['mean']:.4g}, largest {facts['speed']['max']:.4g}"),
+        (f"neighbors within {neighbors['cutoff']:g}", "mean {mean:.1f}, {min} to {max}".format(**neighbors)),
+        ("missing", "\n".join(facts["missing"]) or "nothing"),
+        ("sha256", facts["sha256"]),
+    ]
+
+
+def _split_text(counts: dict) -> str:
+    return f"{counts['trajectories']} trajectories, {counts['frames']} frames"
+
+
+def _range_text(values: dict) -> str:
+    low, high = f"{values['min']:g}", f"{values['max']:g}"
+    return low if low == high else f"{low} to {high}"

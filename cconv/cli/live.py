@@ -1,0 +1,157 @@
+"""Progress of trials in the terminal: a live table, or plain lines where there is no terminal."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+ROWS = 12
+
+
+@dataclass
+class _Row:
+    parameters: Mapping
+    began: float
+    updates: int = 0
+    error: float | None = None
+    rate: float = 0.0
+    outcome: str = "running"
+
+
+@dataclass
+class StudyDisplay:
+    """Shows the trials of a study as they run; an `Observer` of `cconv.study.search`.
+
+    Attributes:
+        console: Where to draw.
+    """
+
+    console: Console
+    _rows: dict[str, _Row] = field(default_factory=dict)
+    _stage: str = ""
+    _num_trials: int = 0
+    _max_updates: int = 1
+    _began: float = 0.0
+    _live: Live | None = None
+
+    def __enter__(self) -> "StudyDisplay":
+        if self.console.is_terminal:
+            self._live = Live(console=self.console, get_renderable=self._draw, refresh_per_second=2, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
+        """Begin a stage with an empty table."""
+        self._stage, self._num_trials, self._max_updates = stage, num_trials, max_updates
+        self._rows, self._began = {}, time.monotonic()
+        self.console.print(f"[bold]{stage}[/bold]: {num_trials} trainings of up to {max_updates} updates")
+
+    def on_trial_start(self, trial: str, parameters: Mapping) -> None:
+        """Add a row."""
+        self._rows[trial] = _Row(dict(parameters), time.monotonic())
+
+    def on_trial_result(self, trial: str, entry: Mapping) -> None:
+        """Update a row."""
+        row = self._rows[trial]
+        row.updates, row.error = entry["updates"], entry["valid_normalized_mse"]
+        row.rate = entry["updates"] / max(entry["seconds"], 1e-9)
+
+    def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
+        """Close a row; without a terminal, print it."""
+        row = self._rows.setdefault(trial, _Row({}, time.monotonic()))
+        row.outcome = outcome
+        if self._live is None or outcome == "failed":
+            ended = sum(other.outcome != "running" for other in self._rows.values())
+            self.console.print(
+                f"{self._stage} {ended}/{self._num_trials}  {trial}  {outcome} at {row.updates} updates, "
+                f"error {_number(row.error)}, best {_number(self._best())}{self._time_left()}  {reason}".rstrip(),
+                highlight=False,
+                soft_wrap=True,
+            )
+
+    def _best(self) -> float | None:
+        errors = [row.error for row in self._rows.values() if row.outcome == "completed" and row.error is not None]
+        return min(errors, default=None)
+
+    def _time_left(self) -> str:
+        ended = sum(row.outcome != "running" for row in self._rows.values())
+        if not ended or ended == self._num_trials:
+            return ""
+        seconds = (time.monotonic() - self._began) / ended * (self._num_trials - ended)
+        return f", about {seconds / 60:.0f} min left in this stage" if seconds > 90 else f", about {seconds:.0f} s left"
+
+    def _draw(self) -> Group:
+        ended = sum(row.outcome != "running" for row in self._rows.values())
+        head = f"{self._stage}: {ended} of {self._num_trials} ended, best {_number(self._best())}{self._time_left()}"
+        return Group(head, self._table())
+
+    def _table(self) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("trial", "state", "updates", "updates/s", "error"):
+            table.add_column(name, justify="left" if name in ("trial", "state") else "right")
+        table.add_column("hyperparameters", overflow="ellipsis", no_wrap=True)
+        running = [(name, row) for name, row in self._rows.items() if row.outcome == "running"]
+        ended = [(name, row) for name, row in self._rows.items() if row.outcome != "running"]
+        best = sorted(ended, key=lambda item: (-item[1].updates, item[1].error or float("inf")))
+        for name, row in [*running, *best[: ROWS - len(running)]]:
+            settings = " ".join(f"{key}={_short(value)}" for key, value in row.parameters.items())
+            updates = f"{row.updates}/{self._max_updates}"
+            table.add_row(name, row.outcome, updates, f"{row.rate:.1f}", _number(row.error), settings)
+        return table
+
+
+class TrainingBar:
+    """Progress of one training: updates, rate, loss, best error, time left; plain lines where there is no terminal.
+
+    Args:
+        console: Where to draw.
+        name: What to call the training.
+        updates: Its budget.
+    """
+
+    def __init__(self, console: Console, name: str, updates: int):
+        self._console, self._updates, self._best = console, updates, None
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total} updates  {task.fields[figures]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._progress.add_task(name, total=updates, figures="")
+
+    def __enter__(self) -> "TrainingBar":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._progress.stop()
+
+    def on_update(self, state) -> None:
+        """Show a `TrainingState`."""
+        valid = state.valid_normalized_mse
+        if valid is not None:
+            self._best = valid if self._best is None else min(self._best, valid)
+        rate = state.updates / state.seconds
+        left = (self._updates - state.updates) / rate
+        figures = f"{rate:.1f}/s  loss {state.train_loss:.3g}  best {_number(self._best)}  {left:.0f} s left"
+        self._progress.update(self._task, completed=state.updates, figures=figures)
+        if valid is not None and not self._console.is_terminal:
+            line = f"{state.updates}/{self._updates} updates, validation error {valid:.4g}, {figures}"
+            self._console.print(line, highlight=False, soft_wrap=True)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _short(value: object) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

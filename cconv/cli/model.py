@@ -1,0 +1,108 @@
+"""`cconv train`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.live import TrainingBar
+from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
+from cconv.errors import ConfigError
+
+
+def train(
+    study: StudyFile,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write; it must not exist yet.")],
+    data: DataPath = None,
+    settings: Settings = None,
+) -> None:
+    """Train the network of a study file, without a search.
+
+    Its tables network and training are used; without a table network that is the published baseline. The checkpoint of
+    the smallest validation error stands in DIR/checkpoint, also after Ctrl-C.
+    """
+    from cconv.study.config import load_study
+    from cconv.study.problem import load_problem, open_study_data, provenance, with_data_path
+    from cconv.study.records import TrialFolder
+    from cconv.study.trial import run_trial
+
+    config = load_study(study, settings or [])
+    if data is not None:
+        config = with_data_path(config, data)
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; give another --out.")
+    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
+    folder = TrialFolder(out)
+    try:
+        with TrainingBar(errors, config.name, config.training.updates) as bar:
+            trial = run_trial(
+                problem, {}, config.network, config.training, folder, stage="train", init_seed=config.seeds.init,
+                data_seed=config.seeds.data, provenance=provenance(config), on_update=bar.on_update,
+            )  # fmt: skip
+            entries = list(trial)
+    except KeyboardInterrupt:
+        folder.finish("interrupted")
+        errors.print(f"Interrupted; the best checkpoint so far is {folder.checkpoint}.", soft_wrap=True)
+        raise
+    if entries[-1]["diverged"]:
+        folder.finish("diverged")
+        errors.print(f"Diverged at update {entries[-1]['updates']}: a loss is not finite; lower the learning rate.")
+        raise typer.Exit(1)
+    folder.finish("completed")
+    best = min(entry["valid_normalized_mse"] for entry in entries)
+    results.print(f"Best validation error {best:.4g} (normalized MSE). Checkpoint: {folder.checkpoint}", soft_wrap=True)
+
+
+def evaluate(
+    checkpoint: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CHECKPOINT", help="Checkpoint folder, e.g. runs/quick/finalists/baseline/seed_1/checkpoint."
+        ),
+    ],
+    data: DataPath = None,
+    split: Annotated[str, typer.Option(help="Split to evaluate: train, valid or test.")] = "test",
+    task: Annotated[
+        str | None, typer.Option(help="Task that the model must be for; an error if it is for another.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
+) -> None:
+    """Error of a saved model on a split of a data set; by default the test split it was reported on."""
+    from cconv.data.targets import iterate_samples
+    from cconv.evaluation.metrics import frame_errors, normalized_mse, per_frame_normalized_mse
+    from cconv.study.problem import data_from_card, open_study_data
+    from cconv.training.checkpoint import load_model, read_card
+
+    model, card = load_model(checkpoint, task), read_card(checkpoint)
+    dataset = open_study_data(data_from_card(card, data), card.get("data_seed", 0))
+    samples = iterate_samples(dataset, split, model.config.task, model.kernel)
+    frames = frame_errors(model, show_progress(samples, f"evaluate {split}"))
+    mse = normalized_mse(frames)
+    facts = {
+        "checkpoint": str(checkpoint),
+        "data": str(dataset.path),
+        "task": model.config.task,
+        "split": split,
+        "frames": len(frames),
+        "normalized_mse": mse,
+        "relative_rmse": mse**0.5,
+        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
+        "num_parameters": model.num_parameters,
+    }
+    if as_json:
+        print_json(facts)
+        return
+    results.print(
+        f"{split}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {len(frames)} frames "
+        f"({model.config.task}, {model.num_parameters:,} parameters)",
+        highlight=False,
+    )
+
+
+def report(path: RunPath) -> None:
+    """Write report.html of a run again, also of one that was interrupted."""
+    from cconv.report.page import write_report
+    from cconv.study.records import RunFolder
+
+    results.print(f"Report: {write_report(RunFolder.open(path))}", soft_wrap=True)

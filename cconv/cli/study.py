@@ -1,0 +1,124 @@
+"""`cconv study`: run a study and look at its state."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.live import StudyDisplay
+
+# Commands import what they run inside, as torch and ray take seconds to load and `--help` should not.
+
+app = typer.Typer(
+    help="Search for the smallest, fastest network that is accurate enough, and report it.", no_args_is_help=True
+)
+
+StudyFile = Annotated[
+    Path, typer.Argument(metavar="STUDY", help="Study file (TOML), e.g. experiments/dpi_density_rate.toml.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, e.g. runs/quick.")]
+DataPath = Annotated[
+    str | None, typer.Option("--data", metavar="DIR", help="Folder of the particle data; replaces data.path.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Replace a setting of the study file, e.g. training.updates=200. Repeatable."
+    ),
+]
+
+
+@app.command()
+def run(
+    study: StudyFile,
+    data: DataPath = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Run folder to write; runs/<study> if not given.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
+    settings: Settings = None,
+) -> None:
+    """Run a whole study: random search, adaptive search, finalists, report.
+
+    Trials run at once on all cores, one core each, and stop early by ASHA. The most accurate configurations and the
+    baseline are then retrained with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn.
+    Ctrl-C stops cleanly: what was recorded stays readable (`cconv study status`, `cconv report`).
+    """
+    from cconv.report.page import write_report
+    from cconv.study.config import load_study
+    from cconv.study.pipeline import run_study
+    from cconv.study.problem import open_study_data, with_data_path
+    from cconv.study.records import RunFolder
+    from cconv.study.space import load_space
+
+    config = load_study(study, settings or [])
+    if data is not None:
+        config = with_data_path(config, data)
+    space = load_space(config.search.space)
+    open_study_data(config.data, config.seeds.data)
+    folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
+    try:
+        with StudyDisplay(errors) as display:
+            summary = run_study(config, space, folder, display, show_progress)
+    except KeyboardInterrupt:
+        report = write_report(folder)
+        errors.print(f"\nInterrupted; everything recorded so far is in {folder.path}, and in {report}.", soft_wrap=True)
+        raise
+    report = write_report(folder)
+    results.print(_finalists_table(summary))
+    results.print(summary["recommended"]["reason"], highlight=False)
+    results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes. Report: {report}", soft_wrap=True)
+
+
+@app.command()
+def status(
+    path: RunPath, as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False
+) -> None:
+    """Show how far a study has come: its state, its trials by outcome, the best so far."""
+    from cconv.study.pipeline import count_outcomes
+    from cconv.study.records import RunFolder
+
+    folder = RunFolder.open(path)
+    records = folder.trials()
+    completed = [record for record in records if record.outcome == "completed" and record.last]
+    best = min(completed, key=lambda record: record.last["valid_normalized_mse"], default=None)
+    facts = {
+        **folder.read("state.json"),
+        "trials": count_outcomes(records),
+        "best": None
+        if best is None
+        else {
+            "trial": best.id,
+            "valid_normalized_mse": best.last["valid_normalized_mse"],
+            "parameters": best.parameters,
+        },
+    }
+    if as_json:
+        print_json(facts)
+        return
+    results.print(f"{path}: {facts['state']}, stage {facts['stage']}", highlight=False)
+    for stage, counts in facts["trials"].items():
+        results.print(f"{stage}: " + ", ".join(f"{number} {name}" for name, number in counts.items() if number))
+    if best is not None:
+        settings = " ".join(f"{key}={value}" for key, value in best.parameters.items())
+        results.print(f"best: {best.id}, validation error {best.last['valid_normalized_mse']:.4g} ({settings})")
+
+
+def _finalists_table(summary: dict) -> Table:
+    table = Table(title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left")
+    for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters"):
+        table.add_column(name, justify="left" if name == "model" else "right")
+    for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
+        test, cost = entry["test"], entry["cost"]
+        mark = " *" if entry["id"] == summary["recommended"]["id"] else ""
+        low, high = test["ci95"]
+        table.add_row(
+            entry["id"] + mark,
+            f"{test['normalized_mse']:.4g}",
+            f"{low:.3g} – {high:.3g}",
+            f"{cost['ms_per_frame']:.2f}",
+            f"{entry['num_parameters']:,}",
+        )
+    return table

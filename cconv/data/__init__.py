@@ -1,0 +1,1 @@
+"""Particle data: readers, splits, generation, targets and features."""

@@ -1,0 +1,53 @@
+"""Folders that appear whole or not at all."""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cconv.errors import ConfigError
+
+
+@contextmanager
+def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterator[Path]:
+    """A temporary folder beside `folder`, renamed to it when all is written and removed if anything fails.
+
+    Args:
+        folder: Where the files shall be; may exist if it is empty.
+        files: Names that will be written. With `overwrite` a folder with nothing else in it is replaced.
+        overwrite: Whether an older data set may be replaced.
+
+    Raises:
+        ConfigError: If the folder exists and must not be replaced, or cannot be written.
+    """
+    folder = folder.absolute()
+    _check_free(folder, set(files), overwrite)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        _replace(folder, partial)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written ({error.strerror or error}); name another folder.") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _check_free(folder: Path, files: set[str], overwrite: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder}: is a file; name a folder to write to.")
+    present = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
+    if present - files and overwrite:
+        others = ", ".join(sorted(present - files)[:3])
+        raise ConfigError(f"{folder}: holds other things than a data set ({others}); name another folder.")
+    if present and not overwrite:
+        raise ConfigError(f"{folder}: exists and is not empty; name another folder or overwrite it.")
+
+
+def _replace(folder: Path, new: Path) -> None:
+    old = folder.with_name(f"{new.name}.old")
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)

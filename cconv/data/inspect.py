@@ -1,0 +1,106 @@
+"""What a data set holds, as plain facts."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+
+import torch
+
+from cconv.data.dataset import Dataset
+from cconv.data.trajectory import Frame, ParticleType, Trajectory
+from cconv.domain import Box
+from cconv.neighbors import radius_graph
+
+
+def inspect_dataset(
+    dataset: Dataset,
+    cutoff: float | None = None,
+    progress: Callable[[Iterable, str], Iterable] = lambda items, label: items,
+) -> dict:
+    """Facts of a data set: strings, numbers, lists and None only, so that they can be written as JSON.
+
+    Every trajectory is read, so damaged data are found. Lengths and times are in the units of the data.
+
+    Args:
+        dataset: What to look at.
+        cutoff: Radius of the neighbour counts; None means twice the particle spacing.
+        progress: Wraps the trajectories of a split to show progress, given a label.
+
+    Raises:
+        DataError: If the data are damaged.
+        ConfigError: If the cutoff is not positive or exceeds half of a periodic axis.
+    """
+    scene = dataset.scene
+    cutoff = 2 * scene.particle_spacing if cutoff is None else cutoff
+    collected = defaultdict(list)
+    splits = {}
+    for split, blocks in dataset.splits.items():
+        splits[split] = {"trajectories": len(blocks), "frames": 0}
+        for k in progress(range(len(blocks)), split):
+            trajectory = dataset.trajectory(split, k)
+            splits[split]["frames"] += len(trajectory)
+            _collect(collected, trajectory, scene.box, cutoff)
+    return {
+        "path": str(dataset.path),
+        "format": dataset.format,
+        "name": scene.name,
+        "sha256": dataset.fingerprint(),
+        "splits": splits,
+        "dim": scene.dim,
+        "particle_spacing": scene.particle_spacing,
+        "frame_dt": scene.frame_dt,
+        "box": {
+            "lower": list(scene.box.lower),
+            "upper": list(scene.box.upper),
+            "periodic": list(scene.box.periodic),
+        },
+        "force": None if scene.force is None else list(scene.force),
+        "velocity_source": scene.velocity_source,
+        "mass_source": scene.mass_source,
+        "particles": {kind.name.lower(): _range(collected[kind]) for kind in ParticleType if max(collected[kind])},
+        "boundary": {"points": _range(collected["boundary_points"]), "normals": all(collected["normals"])},
+        "mass": {"min": min(collected["mass_min"]), "max": max(collected["mass_max"])},
+        "speed": {"mean": _mean(collected["speed_mean"]), "max": max(collected["speed_max"])},
+        "neighbors": {
+            "cutoff": cutoff,
+            "mean": _mean(collected["neighbors_mean"]),
+            "min": min(collected["neighbors_min"]),
+            "max": max(collected["neighbors_max"]),
+        },
+        "missing": list(scene.missing),
+    }
+
+
+def _collect(collected: dict, trajectory: Trajectory, box: Box, cutoff: float) -> None:
+    """Append what one trajectory has; neighbours are counted in its first and last frame."""
+    for kind in ParticleType:
+        collected[kind].append(int((trajectory.particle_types == kind).sum()))
+    boundary = trajectory.boundary
+    collected["boundary_points"].append(0 if boundary is None else len(boundary.positions))
+    collected["normals"].append(boundary is not None and boundary.normals is not None)
+    collected["mass_min"].append(float(trajectory.masses.min()))
+    collected["mass_max"].append(float(trajectory.masses.max()))
+    fluid = trajectory.particle_types == ParticleType.FLUID
+    if not fluid.any():
+        return
+    speeds = torch.linalg.vector_norm(trajectory.velocities[:, fluid].double(), dim=-1)
+    collected["speed_mean"].append(float(speeds.mean()))
+    collected["speed_max"].append(float(speeds.max()))
+    for frame in (trajectory[0], trajectory[-1]):
+        counts = _fluid_neighbors(frame, box, cutoff)
+        collected["neighbors_mean"].append(float(counts.double().mean()))
+        collected["neighbors_min"].append(int(counts.min()))
+        collected["neighbors_max"].append(int(counts.max()))
+
+
+def _fluid_neighbors(frame: Frame, box: Box, cutoff: float) -> torch.Tensor:
+    """Number of other fluid particles within `cutoff` of each fluid particle, (N,)."""
+    positions = frame.positions[frame.particle_types == ParticleType.FLUID]
+    return radius_graph(positions, cutoff, box).row_splits.diff()
+
+
+def _range(values: list[int]) -> dict:
+    return {"min": min(values), "max": max(values)}
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

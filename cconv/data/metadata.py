@@ -1,0 +1,197 @@
+"""metadata.json of the LagrangeBench layout: what it says about a scene, and what we write there.
+
+The key ``cconv`` keeps what the layout has no place for: name, force, where masses come from, what was missing.
+
+Source: Toshev et al. (2023), LagrangeBench: A Lagrangian Fluid Mechanics Benchmarking Suite, and its data sets.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from cconv.data.source import STORED, Given
+from cconv.data.trajectory import Scene
+from cconv.domain import Box
+from cconv.errors import DataError, ShapeError
+
+METADATA = "metadata.json"
+OWN_KEY = "cconv"
+DIFFERENCES = "central differences of positions"
+DAM_BREAK_CASES = ("db", "dam", "dam break")
+OVERRIDES = {"mass": "masses", "particle_spacing": "particle spacing", "frame_dt": "frame dt", "force": "force"}
+
+
+def load_metadata(file: Path) -> dict:
+    """The JSON object in `file`.
+
+    Raises:
+        DataError: If it is not a JSON object.
+    """
+    try:
+        metadata = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{file}: is not valid JSON ({error}); correct it or copy it again.") from error
+    if not isinstance(metadata, dict) or not isinstance(metadata.get(OWN_KEY, {}), dict):
+        raise DataError(f"{file}: must be a JSON object, and so must its `{OWN_KEY}`; correct it or copy it again.")
+    return metadata
+
+
+def default_mass(particle_spacing: float, dim: int) -> float:
+    """Mass of a particle where none is stored: rest density 1 times ``dx ** D``."""
+    return particle_spacing**dim
+
+
+def default_mass_source(particle_spacing: float, dim: int) -> str:
+    """How `Scene.mass_source` tells that masses are `default_mass`."""
+    return f"1 * dx^{dim} = {default_mass(particle_spacing, dim):g}"
+
+
+def scene_from_metadata(
+    metadata: Mapping, file: Path, given: Given, *, stores_velocity: bool, stores_mass: bool, has_boundary: bool
+) -> Scene:
+    """The scene that metadata.json, the members of the files and the user describe together; the user is right.
+
+    Args:
+        metadata: What is stored.
+        file: Where, for messages; the scene is named after its folder unless it has a name.
+        given: What the user says.
+        stores_velocity: Whether velocities are stored.
+        stores_mass: Whether masses are stored.
+        has_boundary: Whether there are wall particles or boundary points.
+
+    Raises:
+        DataError: If a key is missing or its value cannot be.
+        ConfigError: If the given force does not have one number an axis.
+    """
+    dim = _value(metadata, "dim", file, lambda value: value in (1, 2, 3), "1, 2 or 3")
+    spacing = given.particle_spacing or _positive(metadata, "dx", file)
+    frame_dt = given.frame_dt or _positive(metadata, "dt", file) * _positive(metadata, "write_every", file)
+    own = metadata.get(OWN_KEY) or _deduced(metadata, file.parent, dim, stores_velocity, stores_mass)
+    mass_source = str(own.get("mass_source", STORED)) if stores_mass else default_mass_source(spacing, dim)
+    force = given.checked_force(dim) or _own(own, "force", file, lambda value: _is_vector(value, dim), f"{dim} numbers")
+    overridden = tuple(f"{topic}:" for name, topic in OVERRIDES.items() if getattr(given, name) is not None)
+    missing = _own(own, "missing", file, lambda value: isinstance(value, list), "a list of lines") or []
+    return Scene(
+        name=str(own.get("name", file.parent.name)),
+        dim=dim,
+        particle_spacing=spacing,
+        frame_dt=frame_dt,
+        box=_box(metadata, dim, file),
+        force=tuple(force) if force else None,
+        has_boundary=has_boundary,
+        velocity_source=STORED if stores_velocity else DIFFERENCES,
+        mass_source=f"given: {given.mass:g}" if given.mass else mass_source,
+        missing=tuple(line for line in map(str, missing) if not line.startswith(overridden)),
+    )
+
+
+def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> dict:
+    """What metadata.json says about a scene, complete for LagrangeBench.
+
+    Args:
+        scene: The scene.
+        stored: What an earlier metadata.json of the data said (solver, viscosity, ...); kept where it still holds.
+        statistics: Keys that follow from the trajectories: counts, lengths, mean and spread of steps.
+    """
+    keeps_steps = stored.get("dt", 0.0) * stored.get("write_every", 0) == scene.frame_dt
+    return {
+        "case": scene.name,
+        "solver": None,
+        "density_evolution": None,
+        "viscosity": None,
+        "t_end": statistics["sequence_length_train"] * scene.frame_dt,
+        "p_bg_factor": None,
+        "artificial_alpha": None,
+        "free_slip": None,
+        "is_bc_trick": False,
+        "g_ext_magnitude": math.hypot(*scene.force) if scene.force else 0.0,
+        **stored,
+        "dim": scene.dim,
+        "dx": scene.particle_spacing,
+        "dt": stored["dt"] if keeps_steps else scene.frame_dt,
+        "write_every": stored["write_every"] if keeps_steps else 1,
+        "periodic_boundary_conditions": list(scene.box.periodic),
+        "bounds": [list(bounds) for bounds in zip(scene.box.lower, scene.box.upper, strict=True)],
+        "default_connectivity_radius": float(f"{1.45 * scene.particle_spacing:.2g}"),
+        **statistics,
+        OWN_KEY: {
+            "name": scene.name,
+            "force": list(scene.force) if scene.force else None,
+            "mass_source": scene.mass_source,
+            "missing": list(scene.missing),
+        },
+    }
+
+
+def _deduced(metadata: Mapping, folder: Path, dim: int, stores_velocity: bool, stores_mass: bool) -> dict:
+    """What our key would hold for a LagrangeBench set, which has none: name, force and what is missing."""
+    force, force_line = _external_force(metadata, folder, dim)
+    missing = {
+        "velocities": None if stores_velocity else f"not stored; {DIFFERENCES}",
+        "masses": None if stores_mass else f"not stored; rest density 1 times dx^{dim}",
+        "force": force_line,
+    }
+    lines = [f"{topic}: {line}" for topic, line in missing.items() if line]
+    return {"name": folder.name, "force": force, "missing": lines}
+
+
+def _external_force(metadata: Mapping, folder: Path, dim: int) -> tuple[list[float] | None, str | None]:
+    """Constant force, and what cannot be said about it. Gravity of a dam break acts on axis 1."""
+    magnitude = metadata.get("g_ext_magnitude") or 0.0
+    case = str(metadata.get("case", "")).lower()
+    if magnitude and case in DAM_BREAK_CASES and dim > 1:
+        return [-float(magnitude) if axis == 1 else 0.0 for axis in range(dim)], None
+    if magnitude:
+        return None, f"of magnitude {magnitude:g} acts, but its direction is not stored (it may depend on position)"
+    if (folder / "force.py").exists():
+        return None, "given by force.py, which is never run"
+    return None, None
+
+
+def _box(metadata: Mapping, dim: int, file: Path) -> Box:
+    """Bounds and periodic axes; LagrangeBench stores three periodic flags even in 2D."""
+    bounds = _value(metadata, "bounds", file, lambda value: _is_bounds(value, dim), f"{dim} pairs [lower, upper]")
+    periodic = _value(
+        metadata,
+        "periodic_boundary_conditions",
+        file,
+        lambda value: isinstance(value, list) and len(value) >= dim,
+        f"at least {dim} truth values",
+    )
+    try:
+        return Box(*zip(*bounds, strict=True), tuple(map(bool, periodic[:dim])))
+    except ShapeError as error:
+        raise DataError(f"{file}: `bounds`: {error}") from error
+
+
+def _value(metadata: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str):
+    if key not in metadata:
+        raise DataError(f"{file}: key `{key}` is missing; add it ({wanted}).")
+    if not fits(metadata[key]):
+        raise DataError(f"{file}: `{key}` must be {wanted}, got {metadata[key]!r}; correct it.")
+    return metadata[key]
+
+
+def _own(own: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str):
+    if own.get(key) is None:
+        return None
+    if not fits(own[key]):
+        raise DataError(f"{file}: `{OWN_KEY}.{key}` must be {wanted}, got {own[key]!r}; correct it.")
+    return own[key]
+
+
+def _positive(metadata: Mapping, key: str, file: Path) -> float:
+    return _value(metadata, key, file, lambda value: _is_number(value) and value > 0, "a positive number")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_vector(value: object, length: int) -> bool:
+    return isinstance(value, list) and len(value) == length and all(map(_is_number, value))
+
+
+def _is_bounds(value: object, dim: int) -> bool:
+    return isinstance(value, list) and len(value) == dim and all(_is_vector(pair, 2) for pair in value)

@@ -1,0 +1,112 @@
+"""What every reader of particle data offers, what the user may say about data, and the checks that readers share."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cconv.data.trajectory import Scene, Trajectory
+from cconv.errors import ConfigError, DataError
+
+SPLITS = ("train", "valid", "test")
+STORED = "stored"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What the user says about data, in their units; None takes what the data say.
+
+    Attributes:
+        mass: Mass of every particle.
+        particle_spacing: Initial distance of neighbouring particles, dx.
+        frame_dt: Time between stored frames.
+        force: Constant external acceleration, D numbers.
+
+    Raises:
+        ConfigError: If a mass, spacing or time is not positive and finite, or a force is not finite.
+    """
+
+    mass: float | None = None
+    particle_spacing: float | None = None
+    frame_dt: float | None = None
+    force: tuple[float, ...] | None = None
+
+    def __post_init__(self):
+        for name in ("mass", "particle_spacing", "frame_dt"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ConfigError(f"`{name}` must be positive and finite, got {value}.")
+        if self.force is not None:
+            object.__setattr__(self, "force", tuple(float(value) for value in self.force))
+            if not all(math.isfinite(value) for value in self.force):
+                raise ConfigError(f"`force` must be finite, got {self.force}.")
+
+    def checked_force(self, dim: int) -> tuple[float, ...] | None:
+        """The force, after a check that it has one number an axis."""
+        if self.force is not None and len(self.force) != dim:
+            raise ConfigError(f"`force` must have one number an axis ({dim}), got {len(self.force)}.")
+        return self.force
+
+
+class TrajectorySource(Protocol):
+    """A folder of particle data that can be read piece by piece.
+
+    Attributes:
+        format: Name of the layout.
+        scene: What all trajectories share.
+        metadata: What else the data say about themselves, as stored; empty if nothing.
+        files: The data files, in a fixed order.
+        names: Names of all trajectories; unique, stored split first where there is one ("train/00000").
+        stored_splits: Names by split, as files or folders say; empty where they say nothing.
+    """
+
+    format: str
+    scene: Scene
+    metadata: dict
+    files: tuple[Path, ...]
+    names: tuple[str, ...]
+    stored_splits: dict[str, tuple[str, ...]]
+
+    def num_frames(self, name: str) -> int:
+        """Number of stored frames of a trajectory."""
+
+    def read(self, name: str, start: int, stop: int | None) -> Trajectory:
+        """Frames `start` to `stop` (to the end if None) of a trajectory."""
+
+
+def uniform_masses(mass: float, like: Tensor) -> Tensor:
+    """The same mass for each of N particles, (N,), with dtype and device of positions (T, N, D)."""
+    return torch.full((like.shape[1],), mass, dtype=like.dtype, device=like.device)
+
+
+def as_tensor(array: np.ndarray) -> Tensor:
+    """A tensor of its own memory, in native byte order; float32 and float64 stay as they are."""
+    return torch.from_numpy(np.array(array, dtype=array.dtype.newbyteorder("="), order="C"))
+
+
+def check_array(array: object, shape: tuple[int | str, ...], file: Path, place: str, key: str) -> None:
+    """Raise `DataError` unless `array` is a numeric array of `shape`; strings in `shape` match any length."""
+    wanted = ", ".join(str(axis) for axis in shape)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        came = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise DataError(f"{file}: {place}: `{key}` must be numbers of shape ({wanted}), got {came}; write it again.")
+    fits = array.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise DataError(f"{file}: {place}: `{key}` must have shape ({wanted}), got {array.shape}; write it again.")
+
+
+def check_finite(frames: np.ndarray, file: Path, name: str, key: str, first_frame: int = 0) -> None:
+    """Raise `DataError` that names the first of `frames` (T, ...) with a NaN or an infinity."""
+    finite = np.isfinite(frames).reshape(len(frames), -1).all(axis=1)
+    if not finite.all():
+        frame = first_frame + int(np.argmin(finite))
+        raise DataError(
+            f"{file}: trajectory {name}, frame {frame}: `{key}` has a NaN or infinite value; "
+            "the simulation blew up: cut the trajectory before this frame or drop it."
+        )

@@ -1,0 +1,133 @@
+"""What a reader returns: a scene, its trajectories, their frames."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from cconv.domain import Box
+
+
+class ParticleType(IntEnum):
+    """Particle types as LagrangeBench stores them."""
+
+    PAD = -1
+    FLUID = 0
+    SOLID_WALL = 1
+    MOVING_WALL = 2
+    RIGID = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boundary:
+    """Points that stand for the walls of a scene.
+
+    Attributes:
+        positions: (B, D), length.
+        normals: Unit normals (B, D), or None where the data hold none.
+    """
+
+    positions: Tensor
+    normals: Tensor | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What all trajectories of a data set share. Lengths and times are in the units of the data.
+
+    Attributes:
+        name: Short name of the scene.
+        dim: Number of space dimensions D.
+        particle_spacing: Initial distance of neighbouring particles, dx.
+        frame_dt: Time between stored frames.
+        box: Bounds and periodic axes.
+        force: Constant external acceleration, D numbers, or None if there is none or it is not known.
+        has_boundary: Whether there are wall points or wall particles.
+        velocity_source: Where velocities come from: "stored" or "central differences of positions".
+        mass_source: Where masses come from: "stored", or the value that stands in for them and why.
+        missing: One line for everything that the data lack and what was taken instead.
+    """
+
+    name: str
+    dim: int
+    particle_spacing: float
+    frame_dt: float
+    box: Box
+    force: tuple[float, ...] | None
+    has_boundary: bool
+    velocity_source: str
+    mass_source: str
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """All particles at one stored time.
+
+    Attributes:
+        positions: (N, D), length.
+        velocities: (N, D), length per time.
+        masses: (N,).
+        particle_types: (N,), int64, values of `ParticleType`.
+        boundary: Wall points, or None.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    masses: Tensor
+    particle_types: Tensor
+    boundary: Boundary | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """Consecutive frames of one simulation.
+
+    Attributes:
+        name: Name of the trajectory in its file or folder.
+        first_frame: Index of the first frame here within the stored trajectory.
+        positions: (T, N, D), length.
+        velocities: (T, N, D), length per time.
+        masses: (N,).
+        particle_types: (N,), int64.
+        boundary: Wall points of all frames, or None.
+        viscosities: Kinematic viscosity of each particle (N,), or None where the data hold none.
+    """
+
+    name: str
+    first_frame: int
+    positions: Tensor
+    velocities: Tensor
+    masses: Tensor
+    particle_types: Tensor
+    boundary: Boundary | None
+    viscosities: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: int) -> Frame:
+        return Frame(
+            positions=self.positions[index],
+            velocities=self.velocities[index],
+            masses=self.masses,
+            particle_types=self.particle_types,
+            boundary=self.boundary,
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(len(self)))
+
+
+def finite_difference_velocities(positions: Tensor, frame_dt: float, box: Box) -> Tensor:
+    """Velocities (T, N, D) from positions (T, N, D): central differences, one-sided at both ends.
+
+    Steps are minimum-image displacements. A single frame has velocity zero.
+    """
+    if len(positions) == 1:
+        return torch.zeros_like(positions)
+    steps = box.displacement(positions[1:], positions[:-1]) / frame_dt
+    central = (steps[1:] + steps[:-1]) / 2
+    return torch.cat([steps[:1], central, steps[-1:]])

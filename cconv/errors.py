@@ -1,0 +1,50 @@
+"""Errors that a user can act on: what must hold, what came, what to do."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class CConvError(ValueError):
+    """Base of every error that `cconv` raises for input it cannot use."""
+
+
+class ShapeError(CConvError):
+    """A tensor has the wrong shape, dtype or device."""
+
+
+class ConfigError(CConvError):
+    """A setting, study file, search space or checkpoint does not fit."""
+
+
+class DataError(CConvError):
+    """A file or folder of particle data is missing, damaged or inconsistent."""
+
+
+def check_shape(name: str, shape: Iterable[int], expected: tuple[int | str, ...]) -> None:
+    """Raise `ShapeError` unless `shape` matches `expected`; strings in `expected` match any length.
+
+    Args:
+        name: Name of the argument, for the message.
+        shape: The shape that came.
+        expected: What must hold, e.g. ``("particles", 3)``.
+    """
+    shape = tuple(shape)
+    fits = len(shape) == len(expected) and all(
+        isinstance(want, str) or have == want for have, want in zip(shape, expected, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join(str(axis) for axis in expected)
+        raise ShapeError(f"`{name}` must have shape ({wanted}), got {shape}.")
+
+
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Raise `ConfigError` unless `value` is one of `choices`; the message names the nearest."""
+    choices = list(choices)
+    if value not in choices:
+        raise ConfigError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.{did_you_mean(value, choices)}")
+
+
+def did_you_mean(value: object, known: Iterable[str]) -> str:
+    """A hint ``' Did you mean ...?'`` with the nearest known name, or an empty string."""
+    nearest = difflib.get_close_matches(str(value), list(known), n=1, cutoff=0.5)
+    return f" Did you mean {nearest[0]!r}?" if nearest else ""

@@ -1,0 +1,1 @@
+"""Array operations behind the layers in `cconv.nn`."""

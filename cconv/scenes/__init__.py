@@ -1,0 +1,1 @@
+"""Scenes: one file each, with its particles and its physics."""

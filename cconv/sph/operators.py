@@ -1,0 +1,124 @@
+r"""SPH sums over neighbours: density D1, its rate D2, its gradient D3.
+
+Numbers are those of the thesis, section 2.2.1; i is ``edges.receivers``, j is ``edges.senders``, and
+:math:`\nabla_i W_{ij} = W'(r_{ij})\, r_{ij} / |r_{ij}|` with :math:`r_{ij} = x_i - x_j` = ``edges.displacements``.
+"""
+
+import torch
+from torch import Tensor
+
+from cconv.errors import ConfigError, check_shape
+from cconv.neighbors import Edges
+from cconv.sph.kernels import AbstractKernel
+
+
+def density(masses: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+    r"""Density by summation (D1), the particle itself included.
+
+    .. math:: \rho_i = \sum_j m_j W(|r_{ij}|, h)
+
+    Receivers of bipartite edges are points without mass of their own.
+
+    Args:
+        masses: m of the senders (M,).
+        edges: Pairs within at least the kernel's support.
+        kernel: W.
+
+    Returns:
+        ρ of the receivers (N,), mass/length^D.
+
+    Raises:
+        ShapeError: If `masses` does not fit the edges.
+        ConfigError: If the edges do not reach as far as the kernel, or differ from it in dimension.
+    """
+    _check(edges, kernel, masses=(masses, (edges.num_senders,)))
+    rho = _sum_over_neighbours(masses[edges.senders] * kernel.value(edges.distances), edges)
+    if edges.bipartite or edges.includes_self:
+        return rho
+    return rho + masses * kernel.value(masses.new_zeros(()))
+
+
+def density_rate(masses: Tensor, velocities: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+    r"""Material rate of density (D2), exactly d/dt of D1 along the particles' motion.
+
+    .. math:: \frac{D\rho_i}{Dt} = \sum_j m_j (v_i - v_j) \cdot \nabla_i W_{ij}
+
+    Args:
+        masses: m (N,).
+        velocities: v (N, D), length/time.
+        edges: Pairs of the particles within at least the kernel's support.
+        kernel: W.
+
+    Returns:
+        Dρ/Dt (N,), mass/(length^D time).
+
+    Raises:
+        ShapeError: If shapes do not fit the edges.
+        ConfigError: If the edges are bipartite, do not reach as far as the kernel, or differ from it in dimension.
+    """
+    _check_one_set(edges)
+    particles = edges.num_senders
+    _check(edges, kernel, masses=(masses, (particles,)), velocities=(velocities, (particles, edges.dim)))
+    difference = velocities[edges.receivers] - velocities[edges.senders]
+    terms = masses[edges.senders] * (difference * kernel_gradient(edges, kernel)).sum(dim=1)
+    return _sum_over_neighbours(terms, edges)
+
+
+def density_gradient(masses: Tensor, densities: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+    r"""Gradient of density (D3), with the sign that converges to ∇ρ.
+
+    .. math:: \nabla \rho_i = \frac{1}{\rho_i} \sum_j m_j (\rho_j - \rho_i) \nabla_i W_{ij}
+
+    The printed form of the thesis has :math:`(\rho_i - \rho_j)`; with :math:`\nabla_i` the derivative with respect to
+    :math:`x_i` it gives :math:`-\nabla\rho`.
+
+    Args:
+        masses: m (N,).
+        densities: ρ (N,), e.g. from `density`.
+        edges: Pairs of the particles within at least the kernel's support.
+        kernel: W.
+
+    Returns:
+        ∇ρ (N, D), mass/length^(D+1).
+
+    Raises:
+        ShapeError: If shapes do not fit the edges.
+        ConfigError: If the edges are bipartite, do not reach as far as the kernel, or differ from it in dimension.
+    """
+    _check_one_set(edges)
+    particles = edges.num_senders
+    _check(edges, kernel, masses=(masses, (particles,)), densities=(densities, (particles,)))
+    difference = densities[edges.senders] - densities[edges.receivers]
+    terms = (masses[edges.senders] * difference)[:, None] * kernel_gradient(edges, kernel)
+    return _sum_over_neighbours(terms, edges) / densities[:, None]
+
+
+def kernel_gradient(edges: Edges, kernel: AbstractKernel) -> Tensor:
+    """∇_i W_ij of every edge (E, D); zero where two particles coincide."""
+    apart = edges.distances > 0
+    direction = edges.displacements / torch.where(apart, edges.distances, 1.0)[:, None]
+    return kernel.derivative(edges.distances)[:, None] * direction
+
+
+def _sum_over_neighbours(terms: Tensor, edges: Edges) -> Tensor:
+    return terms.new_zeros(edges.num_receivers, *terms.shape[1:]).index_add(0, edges.receivers, terms)
+
+
+def _check(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[int, ...]]) -> None:
+    for name, (tensor, shape) in tensors.items():
+        check_shape(name, tensor.shape, shape)
+    if edges.dim != kernel.dim:
+        raise ConfigError(f"`kernel` must have the dimension of `edges` ({edges.dim}), got {kernel.dim}.")
+    if edges.cutoff < kernel.support_radius * (1 - 1e-9):
+        raise ConfigError(
+            f"`edges` must reach as far as the kernel's support ({kernel.support_radius}), got a cutoff of "
+            f"{edges.cutoff}; build them with radius_graph(positions, kernel.support_radius)."
+        )
+
+
+def _check_one_set(edges: Edges) -> None:
+    if edges.bipartite:
+        raise ConfigError(
+            "`edges` must join the particles of one set, got bipartite edges; build them with "
+            "radius_graph(positions, cutoff) without queries."
+        )

@@ -1,0 +1,165 @@
+"""Study files: what to learn, from which data, how to search. TOML, validated."""
+
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from cconv.errors import ConfigError
+from cconv.sph.kernels import KERNELS
+from cconv.training.field_model import NetworkConfig
+from cconv.validation import StrictModel, validated
+
+
+class DataConfig(StrictModel):
+    """Particle data and targets. Lengths and times in the units of the data; None takes what the data say."""
+
+    path: str | None = None
+    particle_spacing: float | None = Field(None, gt=0)
+    mass: float | None = Field(None, gt=0)
+    frame_dt: float | None = Field(None, gt=0)
+    force: tuple[float, ...] | None = None
+    kernel: str = "cubic_spline"
+    smoothing_length: float | None = Field(None, gt=0)
+    split_fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    gap: int = Field(2, ge=0)
+
+    @field_validator("kernel")
+    @classmethod
+    def _known_kernel(cls, name: str) -> str:
+        if name not in KERNELS:
+            raise ValueError(f"must be one of {', '.join(KERNELS)}")
+        return name
+
+
+class TrainingConfig(StrictModel):
+    """Budget and optimiser of one training. Budgets count gradient updates."""
+
+    updates: int = Field(600, ge=1)
+    evaluate_every: int = Field(50, ge=1)
+    batch_size: int = Field(1, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    schedule: Literal["constant", "cosine", "exponential"] = "cosine"
+    cache_megabytes: int = Field(2048, ge=0)
+
+
+class SearchConfig(StrictModel):
+    """Random and adaptive search with ASHA. `concurrency` None means as many trials at once as cores."""
+
+    space: str
+    random_trials: int = Field(16, ge=1)
+    adaptive_trials: int = Field(16, ge=0)
+    grace_updates: int = Field(50, ge=1)
+    reduction_factor: int = Field(3, ge=2)
+    concurrency: int | None = Field(None, ge=1)
+
+
+class FinalistsConfig(StrictModel):
+    """Retraining of the best configurations with fresh seeds. `updates` None means the search's budget."""
+
+    count: int = Field(3, ge=1)
+    seeds: int = Field(2, ge=2)
+    updates: int | None = Field(None, ge=1)
+    frames_per_block: int = Field(5, ge=1)
+
+
+class CostConfig(StrictModel):
+    """Isolated timing of the finalists."""
+
+    threads: int = Field(1, ge=1)
+    repeats: int = Field(20, ge=3)
+
+
+class SeedsConfig(StrictModel):
+    """Three seeds, never one: split and batch order, initial weights, sampling of configurations."""
+
+    data: int = 0
+    init: int = 0
+    search: int = 0
+
+
+class StudyConfig(StrictModel):
+    """A whole study."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    task: Literal["density_rate", "density_gradient"]
+    data: DataConfig = DataConfig()
+    network: NetworkConfig = NetworkConfig()
+    training: TrainingConfig = TrainingConfig()
+    search: SearchConfig
+    finalists: FinalistsConfig = FinalistsConfig()
+    cost: CostConfig = CostConfig()
+    seeds: SeedsConfig = SeedsConfig()
+
+    @model_validator(mode="after")
+    def _budgets_fit(self) -> "StudyConfig":
+        if self.search.grace_updates > self.training.updates:
+            raise ValueError(
+                f"search.grace_updates ({self.search.grace_updates}) must not exceed "
+                f"training.updates ({self.training.updates})"
+            )
+        if self.search.grace_updates % self.training.evaluate_every:
+            raise ValueError(
+                f"search.grace_updates ({self.search.grace_updates}) must be a multiple of "
+                f"training.evaluate_every ({self.training.evaluate_every}), or no rung would be evaluated"
+            )
+        return self
+
+    @property
+    def concurrency(self) -> int:
+        """Trials at once: as many as cores, unless set."""
+        return self.search.concurrency or os.cpu_count() or 1
+
+
+def read_toml(path: Path | str) -> dict:
+    """Content of a TOML file.
+
+    Raises:
+        ConfigError: If the file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text())
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; give the path of a TOML file.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise ConfigError(f"{path}: not a TOML file ({error}); mend that line.") from error
+
+
+def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
+    """Study from a TOML file; its search space is looked for beside the file, then in the working folder.
+
+    Args:
+        path: The study file.
+        overrides: Settings that replace the file's, as ``"training.updates=100"``; values in TOML or plain text.
+
+    Raises:
+        ConfigError: If the file cannot be read or a key or value does not fit.
+    """
+    path = Path(path)
+    values = read_toml(path)
+    for override in overrides:
+        _apply(values, override)
+    study = validated(StudyConfig, values, path)
+    space = path.parent / study.search.space
+    if space.is_file():
+        study = study.model_copy(update={"search": study.search.model_copy(update={"space": str(space)})})
+    return study
+
+
+def _apply(values: dict, override: str) -> None:
+    name, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {override}: must read key=value, e.g. training.updates=100.")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *tables, key = name.strip().split(".")
+    for table in tables:
+        values = values.setdefault(table, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"--set {override}: `{table}` is not a table; see the study file for its keys.")
+    values[key] = value

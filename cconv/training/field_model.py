@@ -1,0 +1,222 @@
+"""A network together with what it needs to predict a physical field: cutoff, scaling and the target's definition."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from cconv.data.features import Inputs, Standardization, fluid_state, make_inputs, standardize_features
+from cconv.data.features import standardize_vectors as standardize_targets
+from cconv.data.targets import Sample, target_channels
+from cconv.data.trajectory import Frame, Scene
+from cconv.domain import Box
+from cconv.errors import ShapeError
+from cconv.neighbors import radius_graph
+from cconv.nn import ConvGeometry, ConvNet
+from cconv.sph.kernels import kernel_named
+
+
+class NetworkConfig(BaseModel):
+    """Hyperparameters of a ConvNet. The defaults are the published network: 692,902 parameters for 4 inputs, 3 outputs.
+
+    `relative_cutoff` is the filter radius R in particle spacings (published: diameter 0.225 = 1.5·6·0.025 at spacing
+    0.05, so R = 2.25 spacings). The layers have `first_channels`, then `hidden_channels`, and the target's components.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    layers: int = Field(4, ge=1, le=16)
+    first_channels: int = Field(32, ge=1)
+    hidden_channels: int = Field(64, ge=1)
+    kernel_size: int = Field(4, ge=1, le=32)
+    relative_cutoff: float = Field(2.25, gt=0, le=10)
+    mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (
+        "ball_to_cube_volume_preserving"
+    )
+    window: Literal["none", "poly6", "gaussian", "cubic_spline"] = "poly6"
+    interpolation: Literal["linear", "nearest_neighbor", "linear_border"] = "linear"
+    align_corners: bool = True
+    normalize: bool = False
+    message: Literal["absolute", "difference"] = "absolute"
+    activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
+    skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
+    initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
+
+    def layer_channels(self, out_channels: int) -> tuple[int, ...]:
+        """Outputs of each layer."""
+        if self.layers == 1:
+            return (out_channels,)
+        return (self.first_channels, *[self.hidden_channels] * (self.layers - 2), out_channels)
+
+
+class FieldConfig(BaseModel):
+    """Everything that rebuilds a model except its weights; stored as `config.json`.
+
+    Lengths are in the units of the data.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    task: Literal["density_rate", "density_gradient"]
+    dim: int = Field(ge=1, le=3)
+    particle_spacing: float = Field(gt=0)
+    kernel: str
+    smoothing_length: float = Field(gt=0)
+    boundary_channels: int = Field(ge=0)
+    network: NetworkConfig
+
+
+@dataclass(frozen=True)
+class FieldGeometry:
+    """Geometry of one frame, shared by all layers.
+
+    Attributes:
+        fluid: Fluid particles seen from fluid particles.
+        boundary: Boundary points seen from fluid particles, or None.
+    """
+
+    fluid: ConvGeometry
+    boundary: ConvGeometry | None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the geometry takes at most, in bytes."""
+        return self.fluid.nbytes + (0 if self.boundary is None else self.boundary.nbytes)
+
+
+class FieldModel(nn.Module):
+    """Predicts an SPH field at the fluid particles of a frame.
+
+    Args:
+        config: What to build.
+        features: Standardisation of the fluid features, from the training split.
+        targets: Standardisation of the target, from the training split.
+        generator: Source of the initial weights; None for torch's global one.
+    """
+
+    def __init__(
+        self,
+        config: FieldConfig,
+        features: Standardization,
+        targets: Standardization,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        self.config = config
+        network = config.network
+        self.network = ConvNet(
+            config.dim + 2,
+            network.layer_channels(target_channels(config.task, config.dim)),
+            network.kernel_size,
+            config.dim,
+            boundary_channels=config.boundary_channels,
+            activation=network.activation,
+            message=network.message,
+            skip=network.skip,
+            initialization=network.initialization,
+            generator=generator,
+        )
+        for name, values in (("feature", features), ("target", targets)):
+            self.register_buffer(f"{name}_mean", values.mean.float())
+            self.register_buffer(f"{name}_scale", values.scale.float())
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of learned values."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    @property
+    def cutoff(self) -> float:
+        """Filter radius R in the units of the data."""
+        return self.config.network.relative_cutoff * self.config.particle_spacing
+
+    @property
+    def kernel(self):
+        """SPH kernel of the density feature and the target."""
+        return kernel_named(self.config.kernel)(self.config.smoothing_length, self.config.dim)
+
+    def geometry(self, inputs: Inputs) -> FieldGeometry:
+        """Neighbours and filter positions of a frame.
+
+        Raises:
+            ShapeError: If the frame has another dimension or other boundary features than the model.
+        """
+        self._check(inputs)
+        fluid = radius_graph(inputs.positions, self.cutoff, inputs.box)
+        boundary = None
+        if self.config.boundary_channels:
+            edges = radius_graph(inputs.boundary_positions, self.cutoff, inputs.box, queries=inputs.positions)
+            boundary = self._conv_geometry(edges)
+        return FieldGeometry(self._conv_geometry(fluid), boundary)
+
+    def forward(self, inputs: Inputs, geometry: FieldGeometry) -> Tensor:
+        """Standardised field (N, C)."""
+        features = (inputs.features - self.feature_mean) / self.feature_scale
+        boundary = (inputs.boundary_features, geometry.boundary) if geometry.boundary is not None else ()
+        return self.network(features, geometry.fluid, *boundary)
+
+    def standardize_target(self, target: Tensor) -> Tensor:
+        """Field (N, C) in the units of the data to standardised values."""
+        return (target - self.target_mean) / self.target_scale
+
+    @torch.no_grad()
+    def predict(self, inputs: Inputs) -> Tensor:
+        """Field (N, C) in the units of the data."""
+        return self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
+
+    def predict_frame(self, frame: Frame, box: Box) -> Tensor:
+        """Field (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
+        return self.predict(make_inputs(fluid_state(frame, box, self.kernel), frame.boundary, box))
+
+    def _conv_geometry(self, edges) -> ConvGeometry:
+        network = self.config.network
+        return ConvGeometry(
+            edges,
+            network.kernel_size,
+            mapping=network.mapping,
+            window=network.window,
+            interpolation=network.interpolation,
+            align_corners=network.align_corners,
+            normalize=network.normalize,
+        )
+
+    def _check(self, inputs: Inputs) -> None:
+        if inputs.positions.shape[1] != self.config.dim:
+            raise ShapeError(
+                f"The model is for {self.config.dim} dimensions, the data have {inputs.positions.shape[1]}; "
+                "use a checkpoint that was trained on such a scene."
+            )
+        channels = 0 if inputs.boundary_features is None else inputs.boundary_features.shape[1]
+        if channels != self.config.boundary_channels:
+            raise ShapeError(
+                f"The model expects {self.config.boundary_channels} boundary features, the data have {channels}; "
+                "use a checkpoint that was trained on such a scene."
+            )
+
+
+def build_field_model(
+    network: NetworkConfig,
+    scene: Scene,
+    task: str,
+    kernel_name: str,
+    smoothing_length: float,
+    train_samples: Sequence[Sample],
+    generator: torch.Generator | None = None,
+) -> FieldModel:
+    """A fresh model for a scene, standardised by its training samples only."""
+    boundary = train_samples[0].inputs.boundary_features
+    config = FieldConfig(
+        task=task,
+        dim=scene.dim,
+        particle_spacing=scene.particle_spacing,
+        kernel=kernel_name,
+        smoothing_length=smoothing_length,
+        boundary_channels=0 if boundary is None else boundary.shape[1],
+        network=network,
+    )
+    features = standardize_features(sample.inputs.features for sample in train_samples)
+    targets = standardize_targets(sample.target for sample in train_samples)
+    return FieldModel(config, features, targets, generator)

@@ -1,0 +1,38 @@
+import pytest
+import torch
+from systems import kernel, periodic_frame, periodic_scene
+
+from cconv.data.features import fluid_state
+from cconv.data.targets import TASKS, make_sample, target_channels
+from cconv.errors import ConfigError
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_shape_and_dtype(task, generator):
+    scene = periodic_scene()
+    sample = make_sample(periodic_frame(generator), scene, task, kernel(scene), "run", 7)
+    assert sample.target.shape == (64, target_channels(task, 2))
+    assert sample.target.dtype == torch.float32
+    assert (sample.trajectory, sample.frame) == ("run", 7)
+
+
+def test_density_rate_is_the_change_of_density_along_the_motion(generator):
+    """D2 against a central difference of D1 over a small step of the particles."""
+    scene, frame, step = periodic_scene(), periodic_frame(generator), 1e-5
+    densities = []
+    for sign in (-1, 1):
+        moved = fluid_state(frame, scene.box, kernel(scene))
+        shifted = type(frame)(
+            positions=moved.positions + sign * step * moved.velocities, velocities=moved.velocities,
+            masses=moved.masses, particle_types=frame.particle_types, boundary=None,
+        )  # fmt: skip
+        densities.append(fluid_state(shifted, scene.box, kernel(scene)).densities)
+    expected = (densities[1] - densities[0]) / (2 * step)
+    target = make_sample(frame, scene, "density_rate", kernel(scene)).target[:, 0]
+    torch.testing.assert_close(target.double(), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_unknown_task_is_refused_with_the_nearest(generator):
+    scene = periodic_scene()
+    with pytest.raises(ConfigError, match="Did you mean 'density_rate'"):
+        make_sample(periodic_frame(generator), scene, "density_rat", kernel(scene))

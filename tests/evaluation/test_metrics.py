@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+import torch
+from systems import problem
+
+from cconv.evaluation.metrics import (
+    FrameError,
+    blocks_of_errors,
+    bootstrap_interval,
+    frame_errors,
+    normalized_mse,
+    per_frame_normalized_mse,
+)
+from cconv.training.field_model import NetworkConfig
+
+
+def error(value, trajectory="0", frame=0, particles=10):
+    return FrameError(
+        trajectory=trajectory,
+        frame=frame,
+        num_particles=particles,
+        normalized_mse=value,
+        per_frame_normalized_mse=value,
+    )
+
+
+def test_predicting_the_training_mean_has_error_one_on_the_training_split(generator):
+    given = problem(generator)
+    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    for parameter in model.parameters():
+        torch.nn.init.zeros_(parameter)
+    assert normalized_mse(frame_errors(model, given.train_samples)) == pytest.approx(1, rel=1e-5)
+
+
+def test_per_frame_error_divides_by_the_frames_own_variance(generator):
+    given = problem(generator)
+    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    entry = frame_errors(model, given.valid_samples[:1])[0]
+    target = given.valid_samples[0].target
+    physical = (model.predict(given.valid_samples[0].inputs) - target).square().mean() / target.var(correction=0)
+    assert entry.per_frame_normalized_mse == pytest.approx(physical.item(), rel=1e-4)
+    assert per_frame_normalized_mse([entry]) == entry.per_frame_normalized_mse
+
+
+def test_frames_count_by_their_particles():
+    assert normalized_mse([error(1.0, particles=30), error(5.0, particles=10)]) == pytest.approx(2)
+
+
+def test_units_are_trajectories_where_there_are_several():
+    errors = [error(1.0, "a"), error(3.0, "a", 1), error(7.0, "b")]
+    np.testing.assert_allclose(blocks_of_errors(errors, 1), [2, 7])
+
+
+def test_units_are_time_blocks_of_a_single_trajectory():
+    errors = [error(float(frame), frame=frame) for frame in range(5)]
+    np.testing.assert_allclose(blocks_of_errors(errors, 2), [0.5, 2.5, 4])
+
+
+def test_interval_holds_the_mean_and_shrinks_to_a_constant():
+    table = np.random.default_rng(0).lognormal(size=(4, 6))
+    low, high = bootstrap_interval(table)
+    assert low < table.mean() < high
+    assert bootstrap_interval(np.full((2, 3), 0.5)) == (0.5, 0.5)
+
+
+def test_interval_covers_the_true_mean_about_as_often_as_it_says():
+    """Crossed normal effects with known mean 0; small tables make a percentile bootstrap a little too narrow."""
+    rng = np.random.default_rng(1)
+    covered = 0
+    for repeat in range(200):
+        table = rng.normal(size=(12, 1)) + rng.normal(size=(1, 12)) + rng.normal(size=(12, 12))
+        low, high = bootstrap_interval(table, resamples=400, seed=repeat)
+        covered += low <= 0 <= high
+    assert 0.85 <= covered / 200 <= 0.99

@@ -1,0 +1,86 @@
+"""Small scenes that tests build in memory."""
+
+import math
+
+import torch
+
+from cconv.data.targets import Sample, make_sample
+from cconv.data.trajectory import Boundary, Frame, Scene
+from cconv.domain import Box
+from cconv.sph.kernels import CubicSpline
+from cconv.study.problem import Problem
+
+
+def periodic_scene(particles_per_side: int = 8) -> Scene:
+    """A periodic unit square of particles without walls."""
+    return Scene(
+        name="square",
+        dim=2,
+        particle_spacing=1 / particles_per_side,
+        frame_dt=0.01,
+        box=Box([0, 0], [1, 1], True),
+        force=None,
+        has_boundary=False,
+        velocity_source="stored",
+        mass_source="stored",
+        missing=(),
+    )
+
+
+def periodic_frame(generator: torch.Generator, particles_per_side: int = 8) -> Frame:
+    """A jittered lattice in the unit square, with a smooth velocity field and unit density."""
+    spacing = 1 / particles_per_side
+    ticks = (torch.arange(particles_per_side, dtype=torch.float64) + 0.5) * spacing
+    positions = torch.cartesian_prod(ticks, ticks)
+    positions = positions + 0.3 * spacing * (
+        torch.rand(positions.shape, generator=generator, dtype=torch.float64) - 0.5
+    )
+    phase = 2 * math.pi * (positions + torch.rand(2, generator=generator, dtype=torch.float64))
+    velocities = torch.stack([torch.sin(phase[:, 0]) + torch.cos(phase[:, 1]), torch.sin(phase[:, 1])], dim=1)
+    particles = particles_per_side**2
+    return Frame(
+        positions=positions.float(),
+        velocities=velocities.float(),
+        masses=torch.full((particles,), spacing**2),
+        particle_types=torch.zeros(particles, dtype=torch.int64),
+        boundary=None,
+    )
+
+
+def with_walls(frame: Frame, normals: bool = True) -> Frame:
+    """The frame with wall points along y = 0."""
+    points = torch.stack([torch.linspace(0, 1, 9)[:-1], torch.zeros(8)], dim=1)
+    up = torch.tensor([[0.0, 1.0]]).expand(8, 2).clone()
+    return Frame(
+        positions=frame.positions,
+        velocities=frame.velocities,
+        masses=frame.masses,
+        particle_types=frame.particle_types,
+        boundary=Boundary(positions=points, normals=up if normals else None),
+    )
+
+
+def kernel(scene: Scene) -> CubicSpline:
+    """The scene's cubic spline with h = spacing."""
+    return CubicSpline(scene.particle_spacing, scene.dim)
+
+
+def samples(generator: torch.Generator, count: int, task: str = "density_rate", trajectory: str = "0") -> list[Sample]:
+    """Samples of independent frames of the periodic scene."""
+    scene = periodic_scene()
+    return [
+        make_sample(periodic_frame(generator), scene, task, kernel(scene), trajectory, index) for index in range(count)
+    ]
+
+
+def problem(generator: torch.Generator, task: str = "density_rate") -> Problem:
+    """Four training and two validation frames of the periodic scene."""
+    scene = periodic_scene()
+    return Problem(
+        scene=scene,
+        task=task,
+        kernel="cubic_spline",
+        smoothing_length=scene.particle_spacing,
+        train_samples=samples(generator, 4, task, "train"),
+        valid_samples=samples(generator, 2, task, "valid"),
+    )

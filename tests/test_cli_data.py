@@ -1,0 +1,126 @@
+import json
+
+import pytest
+from particle_files import record_frames, write_hdf5, write_parts
+
+from cconv.cli import main
+from cconv.data.dataset import open_dataset
+
+SMALL = ["--trajectories", "3", "--frames", "4", "--particles-per-side", "8"]
+
+
+@pytest.fixture
+def cconv(monkeypatch, capfd):
+    """Run `cconv` with arguments; gives (exit status, stdout, stderr)."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        printed = capfd.readouterr()
+        return caught.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+def assert_one_clear_line(outcome, *words):
+    status, out, error = outcome
+    assert status == 2
+    assert out == ""
+    assert error.startswith("cconv: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert [word for word in words if word not in error] == []
+
+
+def test_generated_set_can_be_inspected(cconv, tmp_path):
+    status, out, _ = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "a", *SMALL, "--seed", 5)
+    assert status == 0
+    assert "64 particles" in out
+    status, out, _ = cconv("data", "inspect", tmp_path / "a")
+    assert status == 0
+    assert "taylor_green_2d" in out
+    assert "nothing" in out
+
+
+def test_inspect_prints_json_for_programs(cconv, tmp_path):
+    write_parts(tmp_path / "a")
+    status, out, _ = cconv("data", "inspect", tmp_path / "a", "--json", "--cutoff", 0.5, "--force", "0,-9.81,0")
+    facts = json.loads(out)
+    assert status == 0
+    assert facts["force"] == [0.0, -9.81, 0.0]
+    assert facts["neighbors"]["cutoff"] == 0.5
+    assert facts["format"] == "DeepLagrangianFluids"
+
+
+def test_inspect_says_what_is_missing(cconv, tmp_path):
+    write_parts(tmp_path / "a")
+    _, out, _ = cconv("data", "inspect", tmp_path / "a")
+    for topic in ("particle spacing:", "frame dt:", "force:", "masses:"):
+        assert topic in out
+
+
+def test_convert_keeps_what_was_given(cconv, tmp_path):
+    for name in ("s1", "s2", "s3"):
+        write_parts(tmp_path / "a", name=name, frames=record_frames(seed=ord(name[1])))
+    given = ["--mass", 0.5, "--particle-spacing", 0.1, "--frame-dt", 0.02, "--force", "0,-1,0"]
+    status, _, _ = cconv("data", "convert", tmp_path / "a", "--out", tmp_path / "b", *given)
+    scene = open_dataset(tmp_path / "b").scene
+    assert status == 0
+    assert (scene.particle_spacing, scene.frame_dt, scene.force) == (0.1, 0.02, (0.0, -1.0, 0.0))
+    assert open_dataset(tmp_path / "b").trajectory("train", 0).masses.tolist() == [0.5] * 5
+
+
+def test_bad_data_ends_in_one_line(cconv, tmp_path):
+    assert_one_clear_line(cconv("data", "inspect", tmp_path / "nowhere"), "nowhere", "does not exist")
+    assert_one_clear_line(cconv("data", "inspect", tmp_path), "looked for")
+    write_hdf5(tmp_path / "a")
+    (tmp_path / "a" / "train.h5").write_bytes(b"")
+    assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--json"), "train.h5", "is empty", "copy it again")
+    assert_one_clear_line(cconv("data", "convert", tmp_path / "a", "--out", tmp_path / "b"), "train.h5")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a"]
+
+
+def test_bad_settings_end_in_one_line(cconv, tmp_path):
+    write_parts(tmp_path / "a")
+    assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--force", "down"), "--force", "'down'")
+    assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--force", "0,-1"), "force", "axis (3)")
+    assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--mass", "-1"), "mass", "positive")
+    outcome = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "b", "--trajectories", 1)
+    assert_one_clear_line(outcome, "num_trajectories")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a"]
+
+
+def test_existing_folder_is_kept_unless_overwritten(cconv, tmp_path):
+    command = ["data", "generate", "taylor_green_2d", "--out", tmp_path / "a", *SMALL]
+    assert cconv(*command)[0] == 0
+    before = open_dataset(tmp_path / "a").fingerprint()
+    assert_one_clear_line(cconv(*command, "--seed", 1), "not empty", "overwrite")
+    assert open_dataset(tmp_path / "a").fingerprint() == before
+    assert cconv(*command, "--seed", 1, "--overwrite")[0] == 0
+    assert open_dataset(tmp_path / "a").fingerprint() != before
+
+
+def test_unknown_command_and_option_end_with_status_2(cconv, tmp_path):
+    for arguments in (["dta"], ["data", "inspekt"], ["data", "inspect"], ["data", "inspect", tmp_path, "--yaml"]):
+        status, out, error = cconv(*arguments)
+        assert status == 2
+        assert "Traceback" not in error
+
+
+def test_interruption_ends_with_status_130_and_leaves_nothing(cconv, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cconv.scenes.taylor_green_2d.TaylorGreen2D.advance", interrupt)
+    status, _, error = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "a", *SMALL)
+    assert status == 130
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", [[], ["data"], ["data", "generate", "taylor_green_2d"], ["data", "inspect"]])
+def test_help_is_given(cconv, command):
+    status, out, _ = cconv(*command, "--help")
+    assert status == 0
+    assert "Usage" in out

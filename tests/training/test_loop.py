@@ -1,0 +1,80 @@
+import math
+
+import pytest
+import torch
+from systems import problem
+
+from cconv.errors import ConfigError
+from cconv.evaluation.metrics import frame_errors, normalized_mse
+from cconv.training.field_model import NetworkConfig
+from cconv.training.loop import SCHEDULES, train
+
+LINEAR = NetworkConfig(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")
+
+
+def run(given, network=LINEAR, seed=0, **options):
+    model = given.build_model(network, seed)
+    options = {"updates": 6, "evaluate_every": 3, "learning_rate": 0.05} | options
+    return model, list(train(model, given.train_samples, given.valid_samples, **options))
+
+
+def test_training_learns_the_density_rate(generator):
+    _, states = run(problem(generator), updates=120, evaluate_every=60)
+    assert states[-1].valid_normalized_mse < 0.1 < states[0].train_loss
+
+
+def test_reported_error_is_the_models(generator):
+    given = problem(generator)
+    model, states = run(given)
+    assert states[-1].valid_normalized_mse == pytest.approx(normalized_mse(frame_errors(model, given.valid_samples)))
+
+
+def test_evaluations_come_when_due_and_at_the_end(generator):
+    _, states = run(problem(generator), updates=7, evaluate_every=3)
+    assert [state.updates for state in states] == list(range(1, 8))
+    assert [state.updates for state in states if state.valid_normalized_mse is not None] == [3, 6, 7]
+
+
+def test_the_same_seeds_give_the_same_losses(generator):
+    given = problem(generator)
+    first, again = (
+        [(state.train_loss, state.valid_normalized_mse) for state in run(given, batch_size=2)[1]] for _ in range(2)
+    )
+    assert first == again
+
+
+def test_without_a_cache_the_result_is_the_same(generator):
+    given = problem(generator)
+    kept, rebuilt = (run(given, cache_bytes=size)[1][-1].train_loss for size in (2**30, 0))
+    assert kept == rebuilt
+
+
+def test_a_batch_is_the_mean_over_its_frames(generator):
+    given = problem(generator)
+    _, states = run(given, batch_size=4, updates=1)
+    losses = [error.normalized_mse for error in frame_errors(given.build_model(LINEAR, 0), given.train_samples)]
+    assert states[0].train_loss == pytest.approx(sum(losses) / 4, rel=1e-5)
+
+
+def test_a_loss_that_is_not_finite_ends_training_and_leaves_the_weights(generator):
+    given = problem(generator)
+    model = given.build_model(LINEAR, 0)
+    model.target_mean.fill_(math.nan)
+    before = model.network.convs[0].filters.clone()
+    states = list(train(model, given.train_samples, given.valid_samples, updates=5, evaluate_every=1))
+    assert len(states) == 1
+    assert states[0].diverged
+    assert torch.equal(model.network.convs[0].filters, before)
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_schedules_start_at_the_full_rate_and_do_not_rise(schedule, generator):
+    _, states = run(problem(generator), updates=10, schedule=schedule)
+    rates = [state.learning_rate for state in states]
+    assert rates[0] == pytest.approx(0.05)
+    assert all(later <= earlier for earlier, later in zip(rates, rates[1:], strict=False))
+
+
+def test_unknown_schedule_is_refused(generator):
+    with pytest.raises(ConfigError, match="Did you mean 'cosine'"):
+        run(problem(generator), schedule="cosin")
