@@ -1,5 +1,6 @@
 """The box that particles live in: bounds, periodic axes, minimum-image displacement and wrap."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +21,8 @@ class Box:
         periodic: One truth value for all axes, or one for each.
 
     Raises:
-        ShapeError: If the corners differ in length or an upper bound is not above its lower one.
+        ShapeError: If the corners differ in length, an upper bound is not above its lower one, or a periodic axis is
+            not finite.
     """
 
     lower: tuple[float, ...]
@@ -38,6 +40,9 @@ class Box:
             )
         if not all(low < high for low, high in zip(lower, upper, strict=True)):
             raise ShapeError(f"`upper` must lie above `lower` on every axis, got {lower} and {upper}.")
+        for low, high, wraps in zip(lower, upper, periodic, strict=True):
+            if wraps and not math.isfinite(high - low):
+                raise ShapeError(f"`lower` and `upper` must be finite on a periodic axis, got {low} and {high}.")
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         object.__setattr__(self, "periodic", periodic)
@@ -74,7 +79,8 @@ class Box:
         lower = torch.as_tensor(self.lower, dtype=positions.dtype, device=positions.device)
         lengths = torch.as_tensor(self.lengths, dtype=positions.dtype, device=positions.device)
         periodic = torch.as_tensor(self.periodic, device=positions.device)
-        offset = torch.remainder(positions - lower, lengths)
-        # The remainder of a tiny negative number rounds to the length itself, which is the lower bound's image.
-        offset = torch.where(offset >= lengths, torch.zeros_like(offset), offset)
-        return torch.where(periodic, lower + offset, positions)
+        upper = torch.as_tensor(self.upper, dtype=positions.dtype, device=positions.device)
+        wrapped = lower + torch.remainder(positions - lower, lengths)
+        # Rounding can reach the upper bound itself, which is the lower bound's image.
+        wrapped = torch.where(wrapped >= upper, lower, wrapped)
+        return torch.where(periodic, wrapped, positions)

@@ -87,11 +87,14 @@ def radius_graph(
 
     Raises:
         ShapeError: If shapes or dtypes do not fit or a coordinate is not finite.
-        ConfigError: If the cutoff is not positive or exceeds half of a periodic axis.
+        ConfigError: If the cutoff is not positive or exceeds half of a periodic axis, or `include_self` comes with
+            `queries`.
     """
     receivers_at = positions if queries is None else queries
     _check_points(positions, receivers_at, box)
     _check_cutoff(cutoff, box)
+    if include_self and queries is not None:
+        raise ConfigError("`include_self` must be False with `queries`: they are other points than `positions`.")
     if queries is None:
         receivers, senders = _pairs_within(_tree(positions, box), cutoff, include_self)
     else:
@@ -114,7 +117,7 @@ def radius_graph(
         num_senders=len(positions),
         cutoff=float(cutoff),
         bipartite=queries is not None,
-        includes_self=include_self and queries is None,
+        includes_self=include_self,
     )
 
 

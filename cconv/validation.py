@@ -1,7 +1,7 @@
 """One clear line for a file that does not fit its pydantic model: file, key, what is wrong, nearest name."""
 
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,12 +33,14 @@ def validated(model: type[Model], values: Mapping, source: Path | str) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_describe(model, error.errors()[0])}") from error
+        # A misspelt key is unknown, and missing under its right name; the first says more.
+        problem = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+        raise ConfigError(f"{source}: {_describe(model, values, problem)}") from error
 
 
-def _describe(model: type[BaseModel], problem: Mapping) -> str:
+def _describe(model: type[BaseModel], values: Mapping, problem: Mapping) -> str:
     location = [str(part) for part in problem["loc"]]
-    key = ".".join(location) or "the file"
+    key = ".".join(_written_path(values, location)) or "the file"
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model, location[:-1])
         listed = f" Known: {', '.join(known)}." if known else ""
@@ -48,6 +50,18 @@ def _describe(model: type[BaseModel], problem: Mapping) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     came = "" if isinstance(problem["input"], Mapping) else f", got {problem['input']!r}"
     return f"`{key}`: {message[0].lower()}{message[1:]}{came}."
+
+
+def _written_path(values: object, location: Sequence[str]) -> list[str]:
+    """The location without the names of union members, which stand in no file."""
+    path = []
+    for part in location:
+        inner = values.get(part) if isinstance(values, Mapping) else None
+        if inner is None and part != location[-1]:
+            continue
+        path.append(part)
+        values = inner
+    return path
 
 
 def _known_keys(model: type[BaseModel], path: Iterable[str]) -> list[str]:

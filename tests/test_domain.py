@@ -131,3 +131,15 @@ def test_bounds_must_have_one_entry_an_axis(lower, upper, periodic):
 def test_upper_must_lie_above_lower(lower, upper):
     with pytest.raises(ShapeError, match="`upper` must lie above `lower`"):
         Box(lower, upper)
+
+
+@pytest.mark.parametrize(("lower", "dtype"), [(1.0, torch.float64), (512.0, torch.float32)])
+def test_wrap_stays_below_the_upper_bound_where_rounding_would_reach_it(lower, dtype):
+    just_outside = torch.nextafter(torch.tensor([[lower]], dtype=dtype), torch.tensor(0.0, dtype=dtype))
+    wrapped = Box((lower,), (lower + 1,), True).wrap(just_outside)
+    assert lower <= wrapped.item() < lower + 1
+
+
+def test_a_periodic_axis_without_end_is_refused():
+    with pytest.raises(ShapeError, match="finite on a periodic axis"):
+        Box((0.0,), (float("inf"),), True)

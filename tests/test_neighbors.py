@@ -281,3 +281,9 @@ def test_cutoff_must_not_pass_half_of_a_periodic_axis():
     assert len(radius_graph(torch.zeros(1, 2), 2.0, box)) == 0
     with pytest.raises(ConfigError, match="at most half of every periodic axis, got 2.01 on axis 1 of length 4.0"):
         radius_graph(torch.zeros(1, 2), 2.01, box)
+
+
+def test_include_self_with_queries_is_refused():
+    points = torch.zeros(2, 2, dtype=torch.float64)
+    with pytest.raises(ConfigError, match="include_self"):
+        radius_graph(points, 0.1, queries=points, include_self=True)

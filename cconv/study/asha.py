@@ -23,6 +23,8 @@ class RecordedASHA(ASHAScheduler):
         grace_updates: First rung.
         reduction_factor: Rungs stand at ``grace_updates · reduction_factor^k``.
         metric: Name of the error in a result.
+        give_up_above: Error at which a trial is stopped whatever the rung holds; the first trial at a rung would
+            otherwise always pass.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class RecordedASHA(ASHAScheduler):
         grace_updates: int,
         reduction_factor: int,
         metric: str,
+        give_up_above: float,
     ):
         super().__init__(
             time_attr="updates",
@@ -45,6 +48,7 @@ class RecordedASHA(ASHAScheduler):
             brackets=1,
         )
         self._rungs_file, self._stage = rungs_file, stage
+        self._give_up_above = give_up_above
         self._names: dict[str, str] = {}
 
     def on_trial_add(self, tune_controller, trial) -> None:
@@ -53,12 +57,12 @@ class RecordedASHA(ASHAScheduler):
         super().on_trial_add(tune_controller, trial)
 
     def on_trial_result(self, tune_controller, trial, result: dict) -> str:
-        """Stop a diverged trial, else decide by the rung; record the rungs."""
+        """Stop a diverged or hopeless trial, else decide by the rung; record the rungs."""
         if result["diverged"]:
             return self.STOP
         decision = super().on_trial_result(tune_controller, trial, result)
         self._write()
-        return decision
+        return self.STOP if result[self._metric] > self._give_up_above else decision
 
     def on_trial_complete(self, tune_controller, trial, result: dict) -> None:
         """Keep a diverged trial out of the rungs; its placeholder error is no measurement."""

@@ -47,13 +47,17 @@ class TrainingConfig(StrictModel):
 
 
 class SearchConfig(StrictModel):
-    """Random and adaptive search with ASHA. `concurrency` None means as many trials at once as cores."""
+    """Random and adaptive search with ASHA. `concurrency` None means as many trials at once as cores.
+
+    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped; 1 is predicting the mean.
+    """
 
     space: str
     random_trials: int = Field(16, ge=1)
     adaptive_trials: int = Field(16, ge=0)
     grace_updates: int = Field(50, ge=1)
     reduction_factor: int = Field(3, ge=2)
+    give_up_above: float = Field(10.0, gt=0)
     concurrency: int | None = Field(None, ge=1)
 
 

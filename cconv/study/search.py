@@ -122,6 +122,7 @@ def _search(
         grace_updates=study.search.grace_updates,
         reduction_factor=study.search.reduction_factor,
         metric=METRIC,
+        give_up_above=study.search.give_up_above,
     )
     observer.on_stage(stage, num_trials, study.training.updates)
     shared = {"run": run, "common": _common(study, study.training, problem)}
