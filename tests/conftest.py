@@ -1,10 +1,54 @@
 """Fixtures that all tests share."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
+
+from cconv.cli import main
+
+SCRIPT = Path(sys.executable).parent / "cconv"
+SMOKE = Path(__file__).parents[1] / "experiments" / "smoke.toml"
 
 
 @pytest.fixture
 def generator():
     """A seeded source of random numbers; a test's draws do not depend on other tests."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def cconv(monkeypatch, capfd):
+    """Run `cconv` with arguments in this process; gives (exit status, stdout, stderr)."""
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        printed = capfd.readouterr()
+        return caught.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def flow_folder(tmp_path_factory):
+    """A small Taylor–Green data set."""
+    from cconv.data.generate import generate_taylor_green_2d
+
+    folder = tmp_path_factory.mktemp("data") / "flow"
+    generate_taylor_green_2d(folder, num_trajectories=4, num_frames=4, particles_per_side=10, seed=0)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory, flow_folder):
+    """Run folder of a whole study of the smallest size, in a process of its own as Ray brings many more."""
+    folder = tmp_path_factory.mktemp("runs") / "smoke"
+    command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert finished.returncode == 0, finished.stderr
+    assert f"Report: {folder / 'report.html'}" in finished.stdout
+    return folder

@@ -3,24 +3,9 @@ import json
 import pytest
 from particle_files import record_frames, write_hdf5, write_parts
 
-from cconv.cli import main
 from cconv.data.dataset import open_dataset
 
 SMALL = ["--trajectories", "3", "--frames", "4", "--particles-per-side", "8"]
-
-
-@pytest.fixture
-def cconv(monkeypatch, capfd):
-    """Run `cconv` with arguments; gives (exit status, stdout, stderr)."""
-
-    def run(*arguments):
-        monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        printed = capfd.readouterr()
-        return caught.value.code or 0, printed.out, printed.err
-
-    return run
 
 
 def assert_one_clear_line(outcome, *words):

@@ -1,0 +1,141 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+
+import pytest
+from conftest import SCRIPT, SMOKE
+
+from cconv import load_model
+
+
+def assert_one_clear_line(outcome, *words):
+    status, out, error = outcome
+    assert status == 2
+    assert out == ""
+    assert error.startswith("cconv: ")
+    assert error.count("\n") == 1
+    assert [word for word in words if word not in error] == []
+
+
+def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):
+    summary = json.loads((finished_run / "summary.json").read_text())
+    for entry in summary["finalists"]:
+        checkpoint = finished_run / entry["checkpoint"]
+        status, out, _ = cconv("evaluate", checkpoint, "--json")
+        assert status == 0
+        reported = entry["test"]["by_seed"][checkpoint.parent.name]
+        assert json.loads(out)["normalized_mse"] == pytest.approx(reported, rel=1e-6)
+
+
+def test_status_and_report_of_a_finished_run(cconv, finished_run):
+    status, out, _ = cconv("study", "status", finished_run, "--json")
+    facts = json.loads(out)
+    assert status == 0
+    assert facts["state"] == "finished"
+    assert facts["best"]["valid_normalized_mse"] > 0
+    status, out, _ = cconv("study", "status", finished_run)
+    assert "finished" in out
+    status, out, _ = cconv("report", finished_run)
+    assert (status, "report.html" in out) == (0, True)
+
+
+def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
+    status, out, _ = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one")
+    assert status == 0
+    assert "Best validation error" in out
+    status, out, _ = cconv("evaluate", tmp_path / "one" / "checkpoint", "--split", "valid", "--json")
+    card = json.loads((tmp_path / "one" / "checkpoint" / "card.json").read_text())
+    assert json.loads(out)["normalized_mse"] == pytest.approx(card["valid_normalized_mse"], rel=1e-6)
+
+
+def test_a_training_that_diverges_says_so(cconv, flow_folder, tmp_path):
+    settings = ["--set", "training.learning_rate=1e30"]
+    status, _, error = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *settings)
+    assert status == 1
+    assert "Diverged" in error
+
+
+def test_bad_input_ends_in_one_line_and_leaves_no_run_folder(cconv, flow_folder, tmp_path):
+    out = ("--out", tmp_path / "run")
+    run = ("study", "run", SMOKE)
+    assert_one_clear_line(cconv(*run, "--data", tmp_path / "nowhere", *out), "nowhere", "does not exist")
+    assert_one_clear_line(cconv(*run, *out), "data.path", "--data")
+    assert_one_clear_line(cconv("study", "run", tmp_path / "no.toml", *out), "no.toml", "no such file")
+    typo = ("--set", "search.random_trial=3")
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *typo, *out), "search.random_trial", "random_trials")
+    outside = ("--set", "network.kernel_size=0")
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *outside, *out), "network.kernel_size", "got 0")
+    nowhere = ("--set", "search.space=none.toml")
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *nowhere, *out), "none.toml", "no such file")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_unknown_key_in_a_search_space_is_named(cconv, flow_folder, tmp_path):
+    space = (SMOKE.parents[1] / "search_spaces" / "smoke.toml").read_text()
+    (tmp_path / "space.toml").write_text(space.replace("reason", "reson", 1))
+    settings = ("--set", f"search.space={tmp_path / 'space.toml'}")
+    outcome = cconv("study", "run", SMOKE, "--data", flow_folder, *settings, "--out", tmp_path / "run")
+    assert_one_clear_line(outcome, "space.toml", "reson", "Did you mean 'reason'")
+
+
+def test_an_existing_run_is_not_touched(cconv, finished_run, flow_folder):
+    before = (finished_run / "summary.json").read_bytes()
+    outcome = cconv("study", "run", SMOKE, "--data", flow_folder, "--out", finished_run)
+    assert_one_clear_line(outcome, "exists already", "--overwrite")
+    assert (finished_run / "summary.json").read_bytes() == before
+
+
+def test_a_checkpoint_of_another_task_is_refused(cconv, finished_run):
+    summary = json.loads((finished_run / "summary.json").read_text())
+    checkpoint = finished_run / summary["finalists"][0]["checkpoint"]
+    outcome = cconv("evaluate", checkpoint, "--task", "density_rate")
+    assert_one_clear_line(outcome, "density_gradient", "density_rate")
+
+
+def test_what_is_no_run_or_checkpoint_is_named(cconv, tmp_path):
+    assert_one_clear_line(cconv("study", "status", tmp_path), "study.json")
+    assert_one_clear_line(cconv("report", tmp_path), "study.json")
+    assert_one_clear_line(cconv("evaluate", tmp_path), "model.safetensors")
+
+
+def interrupt(command, ready, timeout=120):
+    """Start a command in a process group of its own, wait until `ready`, press Ctrl-C; gives its exit status."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+    deadline = time.monotonic() + timeout
+    while not ready() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    return process.returncode, error.decode()
+
+
+def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
+    folder = tmp_path / "run"
+    long = ["--set", "training.updates=100000", "--set", "search.grace_updates=60"]
+    command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder, *long]
+
+    def ready():
+        return any(path.stat().st_size for path in folder.glob("trials/*/log.jsonl"))
+
+    status, error = interrupt(command, ready)
+    assert status == 130
+    assert "Traceback" not in error
+    status, out, _ = cconv("study", "status", folder, "--json")
+    facts = json.loads(out)
+    assert facts["state"] == "interrupted"
+    assert facts["trials"]["random"]["interrupted"] >= 1
+    assert "interrupted" in (folder / "report.html").read_text()
+    assert load_model(next(folder.glob("trials/*/checkpoint"))).num_parameters > 0
+
+
+def test_ctrl_c_leaves_a_usable_checkpoint_of_a_training(flow_folder, tmp_path):
+    folder = tmp_path / "one"
+    command = [SCRIPT, "train", SMOKE, "--data", flow_folder, "--out", folder, "--set", "training.updates=1000000"]
+    status, error = interrupt(command, (folder / "checkpoint").exists)
+    assert status == 130
+    assert "Interrupted" in error
+    assert load_model(folder / "checkpoint").num_parameters > 0
+    shutil.rmtree(folder)
