@@ -37,7 +37,10 @@ class Finalist:
 
 
 def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int, run: RunFolder) -> list[Job]:
-    """Trainings of every finalist with `num_seeds` initialisation seeds that the search did not use."""
+    """Trainings of every finalist with `num_seeds` initialisation seeds that the search did not use.
+
+    They run in this order; the costliest finalist, usually the baseline, is best given first.
+    """
     return [
         Job(
             folder=run.finalist(finalist.id, seed).path,
@@ -45,8 +48,8 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
             parameters=finalist.parameters,
             init_seed=seed,
         )
-        for seed in range(first_seed, first_seed + num_seeds)
         for finalist in finalists
+        for seed in range(first_seed, first_seed + num_seeds)
     ]
 
 
