@@ -24,7 +24,7 @@ check: $(VENV)/.installed
 data: $(DATA)/metadata.json
 
 $(DATA)/metadata.json: $(VENV)/.installed
-	$(VENV)/bin/cconv data generate taylor_green_2d --out $(DATA) --overwrite
+	$(VENV)/bin/cconv data generate taylor_green_2d --out $(DATA) --trajectories 20 --frames 12 --overwrite
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)

@@ -109,7 +109,7 @@ def status(
 def _finalists_table(summary: dict) -> Table:
     table = Table(title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left")
     for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters"):
-        table.add_column(name, justify="left" if name == "model" else "right")
+        table.add_column(name, justify="left" if name == "model" else "right", no_wrap=True)
     for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
         test, cost = entry["test"], entry["cost"]
         mark = " *" if entry["id"] == summary["recommended"]["id"] else ""
@@ -117,7 +117,7 @@ def _finalists_table(summary: dict) -> Table:
         table.add_row(
             entry["id"] + mark,
             f"{test['normalized_mse']:.4g}",
-            f"{low:.3g} – {high:.3g}",
+            f"{low:.3g}–{high:.3g}",
             f"{cost['ms_per_frame']:.2f}",
             f"{entry['num_parameters']:,}",
         )

@@ -146,10 +146,19 @@ def _peak_megabytes(load: Callable[[Path], FieldModel], path: Path, inputs: Inpu
 def _memory_of_predictions(load: Callable[[Path], FieldModel], path: Path, inputs: Inputs, threads: int) -> float:
     torch.set_num_threads(threads)
     model = load(path)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = _peak_resident_megabytes()
     for _ in range(2):
         model.predict(inputs)
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return _peak_resident_megabytes() - before
+
+
+def _peak_resident_megabytes() -> float:
+    """Peak memory of this process. On Linux `getrusage` would hand on the parent's peak, so /proc is asked."""
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
 
 
 @contextmanager

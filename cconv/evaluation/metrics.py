@@ -73,7 +73,7 @@ def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.
 
     Args:
         errors: Errors of the frames of a split, in order.
-        frames_per_block: Frames of a block where there is only one trajectory.
+        frames_per_block: Frames of a block, nearly, where there is only one trajectory; blocks are alike in length.
 
     Returns:
         Mean error of each unit, (units,).
@@ -82,7 +82,8 @@ def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.
     if len(trajectories) > 1:
         groups = [[error for error in errors if error.trajectory == name] for name in trajectories]
     else:
-        groups = [errors[start : start + frames_per_block] for start in range(0, len(errors), frames_per_block)]
+        blocks = np.array_split(np.arange(len(errors)), max(1, round(len(errors) / frames_per_block)))
+        groups = [[errors[index] for index in block] for block in blocks]
     return np.array([normalized_mse(group) for group in groups])
 
 

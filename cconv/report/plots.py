@@ -47,6 +47,8 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
     front = table.loc[summary["pareto_front"]]
     axes.step(front["ms_per_frame"], front["normalized_mse"], where="post", color="0.6", zorder=1, label="front")
     axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel="test error (normalized MSE)")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
     axes.margins(x=0.35, y=0.25)
     threads = summary["finalists"][0]["cost"]["threads"]
     axes.set_title(f"{summary['study']}: error against cost ({threads} thread{'s' if threads > 1 else ''})")

@@ -67,7 +67,7 @@ class FinalistsConfig(StrictModel):
     count: int = Field(3, ge=1)
     seeds: int = Field(2, ge=2)
     updates: int | None = Field(None, ge=1)
-    frames_per_block: int = Field(5, ge=1)
+    frames_per_block: int = Field(3, ge=1)
 
 
 class CostConfig(StrictModel):

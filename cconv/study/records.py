@@ -3,24 +3,22 @@
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from cconv.errors import ConfigError, DataError
 
+SEARCHES = ("random", "adaptive")
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
 
 
 def write_json(path: Path, value) -> None:
     """Write JSON under a temporary name, then rename, so that a reader never finds half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-    with os.fdopen(handle, "w") as file:
-        json.dump(value, file, indent=2)
-        file.write("\n")
-    os.replace(name, path)
+    part = path.with_name(f".{path.name}-{os.getpid()}")
+    part.write_text(json.dumps(value, indent=2) + "\n")
+    os.replace(part, path)
 
 
 def read_json(path: Path):
@@ -150,9 +148,9 @@ class RunFolder:
         return TrialFolder(self.path / "finalists" / finalist_id / f"seed_{seed}")
 
     def trials(self) -> list[TrialRecord]:
-        """Records of all search trials, in order of their names."""
-        folders = sorted((self.path / "trials").glob("*/config.json"))
-        return [TrialFolder(config.parent).read() for config in folders]
+        """Records of all search trials, stage after stage, in the order in which they were drawn."""
+        records = [TrialFolder(config.parent).read() for config in (self.path / "trials").glob("*/config.json")]
+        return sorted(records, key=lambda record: (SEARCHES.index(record.stage), record.id))
 
     def retrainings(self) -> dict[str, list[TrialRecord]]:
         """Records of all retrainings, by finalist."""

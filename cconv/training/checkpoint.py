@@ -1,8 +1,8 @@
 """Models on disk: safetensors, config.json and card.json. Nothing is ever unpickled."""
 
 import json
+import os
 import shutil
-import tempfile
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -28,8 +28,8 @@ def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
         card: Metrics and provenance, JSON values.
     """
     folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    fresh = folder.with_name(f".{folder.name}-{os.getpid()}")
+    fresh.mkdir(parents=True)
     try:
         save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
         (fresh / CONFIG).write_text(model.config.model_dump_json(indent=2))

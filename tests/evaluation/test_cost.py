@@ -35,5 +35,5 @@ def test_measured_costs_are_consistent(generator, tmp_path):
     cost = measure_costs({"small": tmp_path / "model"}, load_model, inputs, threads=1, repeats=4)["small"]
     assert 0 < cost.ms_low <= cost.ms_per_frame <= cost.ms_high
     assert cost.us_per_particle == pytest.approx(1e3 * cost.ms_per_frame / 64)
-    assert cost.peak_mb >= 0
+    assert 0 < cost.peak_mb < 1000
     assert (cost.threads, cost.num_particles) == (1, 64)

@@ -52,8 +52,9 @@ def test_units_are_trajectories_where_there_are_several():
 
 
 def test_units_are_time_blocks_of_a_single_trajectory():
-    errors = [error(float(frame), frame=frame) for frame in range(5)]
-    np.testing.assert_allclose(blocks_of_errors(errors, 2), [0.5, 2.5, 4])
+    errors = [error(float(frame), frame=frame) for frame in range(11)]
+    np.testing.assert_allclose(blocks_of_errors(errors, 3), [1, 4, 7, 9.5])
+    np.testing.assert_allclose(blocks_of_errors(errors[:2], 5), [0.5])
 
 
 def test_interval_holds_the_mean_and_shrinks_to_a_constant():
