@@ -10,12 +10,7 @@ ANALYSIS = Path(__file__).parents[1] / "analysis"
 NOTEBOOKS = sorted(ANALYSIS.glob("*.ipynb"))
 
 
-@pytest.fixture(scope="module")
-def executed():
-    return {path: _execute(path) for path in NOTEBOOKS}
-
-
-def _execute(path):
+def execute(path):
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(ANALYSIS)}}).execute()
     return notebook
@@ -23,9 +18,9 @@ def _execute(path):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_shows_charts_and_tables(path, executed, monkeypatch):
+def test_a_notebook_shows_charts_and_tables(path, monkeypatch):
     monkeypatch.delenv("CCONV_RUN", raising=False)
-    outputs = [output for cell in executed[path].cells for output in cell.get("outputs", [])]
+    outputs = [output for cell in execute(path).cells for output in cell.get("outputs", [])]
     kinds = [kind for output in outputs for kind in output.get("data", {})]
     assert kinds.count("image/png") >= 3
     assert "text/html" in kinds

@@ -63,10 +63,10 @@ def run(
         with StudyDisplay(errors) as display:
             summary = run_study(config, space, folder, display, show_progress)
     except KeyboardInterrupt:
-        report = write_report(folder)
-        errors.print(f"\nInterrupted; everything recorded so far is in {folder.path}, and in {report}.", soft_wrap=True)
+        errors.print(f"\nInterrupted; everything recorded so far is in {folder.path}.", soft_wrap=True)
         raise
-    report = write_report(folder)
+    finally:
+        report = write_report(folder)
     results.print(_finalists_table(summary))
     results.print(summary["recommended"]["reason"], highlight=False)
     results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes. Report: {report}", soft_wrap=True)

@@ -74,7 +74,7 @@ def make_sample(frame: Frame, scene: Scene, task: str, kernel, trajectory: str =
 
 def iterate_samples(dataset: Dataset, split: str, task: str, kernel) -> Iterator[Sample]:
     """Samples of all frames of a split, in order."""
-    for block in range(len(dataset.splits[split])):
-        trajectory = dataset.trajectory(split, block)
+    check_choice("split", split, dataset.splits)
+    for trajectory in dataset.trajectories(split):
         for index, frame in enumerate(trajectory):
             yield make_sample(frame, dataset.scene, task, kernel, trajectory.name, trajectory.first_frame + index)

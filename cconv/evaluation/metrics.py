@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 import torch
 
 from cconv.data.targets import Sample
@@ -18,14 +19,15 @@ class FrameError:
         frame: Index of the frame in it.
         num_particles: Fluid particles N.
         normalized_mse: Mean squared error over particles and components / variance of the target over training.
-        per_frame_normalized_mse: The same, divided by the variance of this frame's own target (the thesis's measure).
+        per_frame_normalized_mse: The same, divided by the variance of this frame's own target (the thesis's measure);
+            None where that target is constant.
     """
 
     trajectory: str
     frame: int
     num_particles: int
     normalized_mse: float
-    per_frame_normalized_mse: float
+    per_frame_normalized_mse: float | None
 
 
 @torch.no_grad()
@@ -49,7 +51,7 @@ def frame_errors(model, samples: Iterable[Sample], geometry: Callable | None = N
                 frame=sample.frame,
                 num_particles=len(target),
                 normalized_mse=squared,
-                per_frame_normalized_mse=squared / own_variance if own_variance > 0 else float("nan"),
+                per_frame_normalized_mse=squared / own_variance if own_variance > 0 else None,
             )
         )
     return errors
@@ -61,9 +63,13 @@ def normalized_mse(errors: Sequence[FrameError]) -> float:
     return float(np.average([error.normalized_mse for error in errors], weights=weights))
 
 
-def per_frame_normalized_mse(errors: Sequence[FrameError]) -> float:
-    """Mean over frames of the error z-scored by each frame's own target; only to compare with the thesis."""
-    return float(np.mean([error.per_frame_normalized_mse for error in errors]))
+def per_frame_normalized_mse(errors: Sequence[FrameError]) -> float | None:
+    """Mean over frames of the error z-scored by each frame's own target; only to compare with the thesis.
+
+    Frames with a constant target do not count; None if there are no others.
+    """
+    defined = [error.per_frame_normalized_mse for error in errors if error.per_frame_normalized_mse is not None]
+    return float(np.mean(defined)) if defined else None
 
 
 def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.ndarray:
@@ -87,28 +93,28 @@ def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.
     return np.array([normalized_mse(group) for group in groups])
 
 
-def bootstrap_interval(
-    values: np.ndarray, *, confidence: float = 0.95, resamples: int = 4000, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of a crossed table.
+def crossed_interval(values: np.ndarray, mean: float, confidence: float = 0.95) -> tuple[float, float]:
+    r"""Interval of a mean error over seeds and units, both seen as draws of many.
 
-    Seeds and units (trajectories or time blocks) are resampled independently, with replacement, so that both sources
-    of variation count.
+    With :math:`s_a^2, s_b^2` the variances of the means of rows and columns, the variance of the mean is taken as
+    :math:`s_a^2/A + s_b^2/B`, with Satterthwaite's degrees of freedom (Satterthwaite, "An approximate distribution of
+    estimates of variance components", Biometrics Bulletin 2 (1946)). Two or three seeds are too few to resample; the
+    t-distribution says so by a wide interval. It is symmetric on a log scale, as errors are positive. With a single
+    unit it covers the seeds alone.
 
     Args:
-        values: Errors (seeds, units).
-        confidence: Share of the resampled means within the interval.
-        resamples: Number of resampled means.
-        seed: Seed of the resampling.
+        values: Errors (seeds, units), at least two seeds.
+        mean: The reported mean error, at the centre.
+        confidence: Share of such intervals that hold the true mean.
 
     Returns:
         Lower and upper end.
     """
-    rng = np.random.default_rng(seed)
-    num_seeds, num_units = values.shape
-    rows = rng.integers(num_seeds, size=(resamples, num_seeds))
-    columns = rng.integers(num_units, size=(resamples, num_units))
-    means = values[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2))
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(means, [tail, 1 - tail])
-    return float(low), float(high)
+    parts = [means.var(ddof=1) / len(means) for means in (values.mean(axis=1), values.mean(axis=0)) if len(means) > 1]
+    counts = [count for count in values.shape if count > 1]
+    variance = sum(parts)
+    if variance == 0 or mean <= 0:
+        return mean, mean
+    freedom = variance**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
+    width = scipy.stats.t.ppf((1 + confidence) / 2, freedom) * variance**0.5 / mean
+    return float(mean * np.exp(-width)), float(mean * np.exp(width))

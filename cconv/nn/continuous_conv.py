@@ -28,7 +28,8 @@ INITIALIZATIONS = ("xavier_uniform", "open3d", "thesis")
 class ConvGeometry:
     """Where each edge reads the filter grid, and with which weight.
 
-    The filter radius R is the cutoff of the edges. The defaults are the published ConvNet's.
+    The filter radius R is the cutoff of the edges. The defaults are the published ConvNet's. As in Open3D, nothing is
+    differentiated with respect to positions.
 
     Args:
         edges: Pairs of receivers i and senders j.
@@ -68,7 +69,7 @@ class ConvGeometry:
         importance = window_values((edges.distances / edges.cutoff) ** 2, window)
         if normalize:
             importance = importance / _row_sums(importance, edges)[edges.receivers]
-        self.cells, self.weights = cells.int(), weights * importance[:, None]
+        self.cells, self.weights = cells.int(), (weights * importance[:, None]).detach()
 
     @property
     def num_receivers(self) -> int:
@@ -83,9 +84,10 @@ class ConvGeometry:
     @property
     def nbytes(self) -> int:
         """Memory in bytes once every matrix has been asked for."""
-        entries = self.cells.numel()
-        indices, matrices = entries * self.cells.element_size(), 4 * entries * (4 + self.weights.element_size())
-        return indices + self.weights.nbytes + matrices + self.receivers.nbytes + self.senders.nbytes
+        entries, places = self.cells.numel(), (self.num_receivers + self.num_senders) * self.num_cells
+        matrices = 4 * entries * (4 + self.weights.element_size()) + 2 * 4 * places
+        sums = self.num_receivers * self.num_cells * self.weights.element_size()
+        return matrices + sums + sum(t.nbytes for t in (self.cells, self.weights, self.receivers, self.senders))
 
     @cached_property
     def gather(self) -> SparseRows:
@@ -103,7 +105,7 @@ class ConvGeometry:
         return SparseRows(
             (self.row_splits * points).int(),
             columns.flatten().int(),
-            self.weights.detach().flatten(),
+            self.weights.flatten(),
             self.num_senders * self.num_cells,
         )
 

@@ -30,7 +30,7 @@ class SparseRows:
     def from_entries(cls, rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> "SparseRows":
         """Matrix of `shape` from entries in any order; entries at the same place are added."""
         coordinates = (rows.cpu().numpy(), columns.cpu().numpy())
-        matrix = scipy.sparse.coo_array((values.detach().cpu().numpy(), coordinates), shape=shape).tocsr()
+        matrix = scipy.sparse.coo_array((values.cpu().numpy(), coordinates), shape=shape).tocsr()
         return cls._from_scipy(matrix.indptr, matrix.indices, matrix.data, shape[1], values.device)
 
     @classmethod

@@ -50,9 +50,11 @@ def render_report(run: RunFolder) -> str:
 
 
 def _comparison(summary: dict) -> dict:
-    """The recommended model beside the baseline, as ratios."""
+    """The recommended model beside the baseline, as ratios where the baseline finished."""
     entries = {entry["id"]: entry for entry in summary["finalists"]}
-    baseline, chosen = entries[summary["baseline"]], entries[summary["recommended"]["id"]]
+    baseline, chosen = entries.get(summary["baseline"]), entries[summary["recommended"]["id"]]
+    if baseline is None:
+        return {"baseline": None, "chosen": chosen}
     return {
         "baseline": baseline,
         "chosen": chosen,

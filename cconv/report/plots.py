@@ -72,11 +72,12 @@ def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> F
     for stage, color in _STAGES.items():
         if stage in set(trials["stage"]):
             search.plot([], [], color=color, label=f"{stage} search")
-    names = sorted(retrained["name"].unique(), key=lambda name: (name != baseline, name))
-    colors = dict(zip(names, [_BASELINE, *sns.color_palette("deep", max(len(names) - 1, 1))], strict=False))
-    for (name, seed), curve in retrained.groupby(["name", "seed"]):
-        label = name if seed == retrained["seed"].min() else None
-        finals.plot(curve["updates"], curve["valid_normalized_mse"], color=colors[name], label=label, lw=1.2)
+    challengers = sorted(set(retrained["name"]) - {baseline})
+    colors = {baseline: _BASELINE} | dict(zip(challengers, sns.color_palette("deep", len(challengers)), strict=True))
+    for name, lines in retrained.groupby("name"):
+        for number, (_, curve) in enumerate(lines.groupby("seed")):
+            style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
+            finals.plot(curve["updates"], curve["valid_normalized_mse"], **style)
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
         axes.set(yscale="log", xlabel="gradient updates", ylabel="validation error (normalized MSE)", title=title)
         if axes.get_legend_handles_labels()[0]:

@@ -1,7 +1,7 @@
-"""Ray's ASHA and Optuna search with three corrections that a trustworthy record needs.
+"""Ray's ASHA and Optuna search with the corrections that a trustworthy record needs.
 
-Ray's scheduler never stops a trial whose error is not finite, forgets its rungs with the process, and its Optuna search
-tells Optuna that stopped trials are complete. Source of the algorithm: Li et al., "A System for Massively Parallel
+Ray's scheduler never stops a trial whose error is not finite and leaves no record of its rungs; its Optuna search tells
+Optuna that stopped trials are complete. Source of the algorithm: Li et al., "A System for Massively Parallel
 Hyperparameter Tuning" (MLSys 2020), algorithm 2 (the stopping variant).
 """
 
@@ -92,8 +92,9 @@ class RungAwareOptunaSearch(OptunaSearch):
         self._ot_trials[trial_id].report(result[self.metric], int(result["updates"]))
 
     def on_trial_complete(self, trial_id: str, result: dict | None = None, error: bool = False) -> None:
-        """Report the last error; PRUNED below the full budget, COMPLETE at it, FAIL after an error."""
-        if result is not None and not error and result["updates"] < self._max_updates:
+        """Report the last error; PRUNED if diverged or below the full budget, COMPLETE at it, FAIL after an error."""
+        known = trial_id in self._ot_trials and trial_id not in self._completed_trials
+        if known and result and not error and (result["diverged"] or result["updates"] < self._max_updates):
             self._ot_trials[trial_id].report(result[self.metric], int(result["updates"]))
             result = None
         super().on_trial_complete(trial_id, result, error)

@@ -36,7 +36,7 @@ class DataConfig(StrictModel):
 
 
 class TrainingConfig(StrictModel):
-    """Budget and optimiser of one training. Budgets count gradient updates."""
+    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache."""
 
     updates: int = Field(600, ge=1)
     evaluate_every: int = Field(50, ge=1)
@@ -80,9 +80,9 @@ class CostConfig(StrictModel):
 class SeedsConfig(StrictModel):
     """Three seeds, never one: split and batch order, initial weights, sampling of configurations."""
 
-    data: int = 0
-    init: int = 0
-    search: int = 0
+    data: int = Field(0, ge=0)
+    init: int = Field(0, ge=0)
+    search: int = Field(0, ge=0)
 
 
 class StudyConfig(StrictModel):

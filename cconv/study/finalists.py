@@ -11,14 +11,14 @@ from cconv.data.targets import Sample
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.metrics import (
     blocks_of_errors,
-    bootstrap_interval,
+    crossed_interval,
     frame_errors,
     normalized_mse,
     per_frame_normalized_mse,
 )
 from cconv.study.records import RunFolder, TrialRecord
 from cconv.study.search import Job
-from cconv.training.checkpoint import load_model
+from cconv.training.checkpoint import load_model, read_card, save_model
 
 BASELINE = "baseline"
 
@@ -34,6 +34,32 @@ class Finalist:
 
     id: str
     parameters: dict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retrained:
+    """A finalist all of whose retrainings finished.
+
+    Attributes:
+        id: Its id.
+        records: Its retrainings, one a seed.
+        checkpoints: Checkpoint folder of each.
+    """
+
+    id: str
+    records: list[TrialRecord]
+    checkpoints: list[Path]
+
+    @property
+    def valid_errors(self) -> list[float]:
+        """Validation error of each checkpoint: the best of its evaluations."""
+        logs = [record.log for record in self.records]
+        return [min(entry["valid_normalized_mse"] for entry in log) for log in logs]
+
+    @property
+    def best_checkpoint(self) -> Path:
+        """Checkpoint of the smallest validation error."""
+        return self.checkpoints[int(np.argmin(self.valid_errors))]
 
 
 def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int, run: RunFolder) -> list[Job]:
@@ -53,66 +79,67 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
     ]
 
 
-def finished_retrainings(run: RunFolder) -> dict[str, list[TrialRecord]]:
-    """Retrainings of each finalist; those of a finalist with a seed that did not finish are left out."""
-    return {
-        finalist: records
-        for finalist, records in run.retrainings().items()
-        if all(record.outcome == "completed" and record.last is not None for record in records)
-    }
+def retrained_finalists(run: RunFolder, num_seeds: int) -> tuple[list[Retrained], dict[str, str]]:
+    """Finalists all of whose seeds finished, and for each other one what became of it."""
+    retrained, failed = [], {}
+    for finalist, records in run.retrainings().items():
+        lost = [record for record in records if record.outcome != "completed"]
+        if lost or len(records) < num_seeds:
+            ends = [f"{record.id} {record.outcome} {record.reason}".strip() for record in lost]
+            failed[finalist] = "; ".join(ends) or f"only {len(records)} of {num_seeds} seeds were trained"
+        else:
+            folders = [run.finalist(finalist, record.config["init_seed"]).checkpoint for record in records]
+            retrained.append(Retrained(id=finalist, records=records, checkpoints=folders))
+    return retrained, failed
 
 
-def best_valid_error(record: TrialRecord) -> float:
-    """Validation error of the record's checkpoint: the best of its evaluations."""
-    return min(e["valid_normalized_mse"] for e in record.log if e["valid_normalized_mse"] is not None)
-
-
-def checkpoint_of(run: RunFolder, finalist: str, records: Sequence[TrialRecord]) -> Path:
-    """Checkpoint of a finalist's best seed by validation error."""
-    best = min(records, key=best_valid_error)
-    return run.path / "finalists" / finalist / best.id / "checkpoint"
-
-
-def evaluate_finalist(
-    run: RunFolder, finalist: str, records: Sequence[TrialRecord], samples: Sequence[Sample], frames_per_block: int
-) -> dict:
+def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> dict:
     """Test errors of a finalist over its seeds, as they stand in summary.json.
 
     Args:
-        run: The study's run folder.
-        finalist: Its id.
-        records: Its retrainings.
+        finalist: The finalist.
         samples: Frames of the test split.
         frames_per_block: Frames of a unit of the interval where there is a single test trajectory.
     """
-    models = [load_model(run.path / "finalists" / finalist / record.id / "checkpoint") for record in records]
-    errors = [frame_errors(model, samples) for model in models]
+    errors = [frame_errors(load_model(checkpoint), samples) for checkpoint in finalist.checkpoints]
     by_seed = [normalized_mse(seed) for seed in errors]
+    per_frame = [per_frame_normalized_mse(seed) for seed in errors]
     units = np.stack([blocks_of_errors(seed, frames_per_block) for seed in errors])
     mean = float(np.mean(by_seed))
     return {
         "normalized_mse": mean,
         "relative_rmse": math.sqrt(mean),
-        "per_frame_normalized_mse": float(np.mean([per_frame_normalized_mse(seed) for seed in errors])),
-        "ci95": list(bootstrap_interval(units)),
-        "by_seed": dict(zip([record.id for record in records], by_seed, strict=True)),
+        "per_frame_normalized_mse": None if None in per_frame else float(np.mean(per_frame)),
+        "ci95": list(crossed_interval(units, mean)),
+        "by_seed": dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         "units": {"count": units.shape[1], "worst": float(units.mean(axis=0).max())},
     }
 
 
-def finalist_entry(
-    finalist: str, records: Sequence[TrialRecord], test: Mapping, cost: Cost, checkpoint: Path, run: RunFolder
-) -> dict:
+def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, run: RunFolder) -> dict:
     """A finalist's entry in summary.json."""
-    config = records[0].config
+    config = finalist.records[0].config
     return {
-        "id": finalist,
+        "id": finalist.id,
         "config": {"network": config["network"], "training": config["training"], "parameters": config["parameters"]},
         "num_parameters": config["num_parameters"],
-        "valid": {"normalized_mse": float(np.mean([best_valid_error(record) for record in records]))},
+        "valid": {"normalized_mse": float(np.mean(finalist.valid_errors))},
         "test": dict(test),
         "cost": asdict(cost),
         "stability": None,
-        "checkpoint": str(checkpoint.relative_to(run.path)),
-        "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in records])),
+        "checkpoint": str(finalist.best_checkpoint.relative_to(run.path)),
+        "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
     }
+
+
+def complete_cards(finalist: Retrained, test: Mapping, environment: Mapping) -> None:
+    """Add test errors and provenance to the card beside each of a finalist's models."""
+    for record, folder in zip(finalist.records, finalist.checkpoints, strict=True):
+        own = {"normalized_mse": test["by_seed"][record.id]}
+        card = read_card(folder) | {
+            "finalist": finalist.id,
+            "test": own | {"mean_over_seeds": test["normalized_mse"], "ci95": test["ci95"]},
+            "data_sha256": environment["data"]["sha256"],
+            "git_commit": environment["git_commit"],
+        }
+        save_model(load_model(folder), folder, card)

@@ -8,7 +8,7 @@ from optuna.storages import BaseStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from cconv.study.records import TrialRecord
+from cconv.study.records import DIVERGED_ERROR, TrialRecord
 from cconv.study.space import SearchSpace, optuna_distributions
 
 
@@ -24,7 +24,8 @@ def mirror_trials(
     """Add finished trials to an Optuna study.
 
     Only a trial of the full budget is COMPLETE; one stopped earlier is PRUNED with its errors at each evaluation, so
-    that errors of different budgets are never compared as equals. Trials without any finite error are FAIL.
+    that errors of different budgets are never compared as equals. A diverged trial is PRUNED with a huge last error, so
+    that the sampler keeps away from it; a trial without any error is FAIL.
     """
     study = optuna.create_study(storage=storage, study_name=study_name, direction="minimize", load_if_exists=True)
     for record in records:
@@ -37,6 +38,8 @@ def _as_optuna(record: TrialRecord, space: SearchSpace, max_updates: int) -> Fro
         for entry in record.log
         if entry["valid_normalized_mse"] is not None
     }
+    if record.outcome == "diverged" and record.log:
+        values[record.log[-1]["updates"]] = DIVERGED_ERROR
     complete = record.outcome == "completed" and max_updates in values
     state = TrialState.COMPLETE if complete else TrialState.PRUNED if values else TrialState.FAIL
     return create_trial(

@@ -12,20 +12,19 @@ from cconv.study.environment import describe_environment
 from cconv.study.finalists import (
     BASELINE,
     Finalist,
-    best_valid_error,
-    checkpoint_of,
+    complete_cards,
     evaluate_finalist,
     finalist_entry,
     finalist_jobs,
-    finished_retrainings,
+    retrained_finalists,
 )
 from cconv.study.observer import Observer
 from cconv.study.problem import Problem, load_problem, open_study_data, study_samples
 from cconv.study.records import OUTCOMES, RunFolder, TrialRecord
-from cconv.study.search import adaptive_search, random_search, ray_session, run_jobs
+from cconv.study.search import Session, adaptive_search, random_search, ray_session, run_jobs
 from cconv.study.selection import choose_finalists, pareto_front, recommend
 from cconv.study.space import SearchSpace, configure
-from cconv.training.checkpoint import load_model, read_card, save_model
+from cconv.training.checkpoint import load_model
 
 Progress = Callable[[Iterable, str], Iterable]
 
@@ -50,7 +49,7 @@ def run_study(
         The summary, as it stands in summary.json.
 
     Raises:
-        ConfigError: If no trial reached the full budget.
+        ConfigError: If no finalist could be retrained.
         DataError: If the data cannot be read.
     """
     start = time.perf_counter()
@@ -62,11 +61,12 @@ def run_study(
         dataset = open_study_data(study.data, study.seeds.data)
         run.write("environment.json", describe_environment(study, dataset))
         problem = load_problem(study, dataset, progress)
-        for stage in _stages(study, space, problem, run, observer):
+        session = Session(study=study, space=space, problem=problem, run=run, observer=observer)
+        for stage in _stages(session):
             run.set_state("running", stage)
         stage = "summary"
         run.set_state("running", stage)
-        summary = _summarize(study, dataset, problem, run, progress)
+        summary = _summarize(session, dataset, progress)
     except BaseException as error:
         run.set_state("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", stage)
         raise
@@ -76,20 +76,19 @@ def run_study(
     return summary
 
 
-def _stages(
-    study: StudyConfig, space: SearchSpace, problem: Problem, run: RunFolder, observer: Observer
-) -> Iterable[str]:
+def _stages(session: Session) -> Iterable[str]:
     """Run the trainings of a study; yields the name of each stage before it begins."""
-    with ray_session(study.concurrency) as storage:
+    study, run = session.study, session.run
+    with ray_session(session):
         yield "random"
-        random_search(study, space, problem, run, storage, observer)
+        random_search(session)
         if study.search.adaptive_trials:
             yield "adaptive"
-            adaptive_search(study, space, problem, run, storage, observer)
+            adaptive_search(session)
         yield "finalists"
-        finalists = [Finalist(id=BASELINE, parameters=space.baseline), *_finalists(study, space, problem, run)]
+        finalists = [Finalist(id=BASELINE, parameters=session.space.baseline), *_challengers(session)]
         jobs = finalist_jobs(finalists, study.finalists.seeds, study.seeds.init + 1, run)
-        run_jobs(jobs, "finalists", study, finalist_training(study), problem, storage, observer)
+        run_jobs(session, jobs, "finalists", finalist_training(study))
 
 
 def finalist_training(study: StudyConfig) -> TrainingConfig:
@@ -97,15 +96,12 @@ def finalist_training(study: StudyConfig) -> TrainingConfig:
     return study.training.model_copy(update={"updates": study.finalists.updates or study.training.updates})
 
 
-def _finalists(study: StudyConfig, space: SearchSpace, problem: Problem, run: RunFolder) -> list[Finalist]:
-    records = [record for record in run.trials() if record.parameters != space.baseline]
-    cost = {record.id: _flops(record, study, problem) for record in records}
-    chosen = choose_finalists(records, cost, study.finalists.count)
-    if not chosen:
-        raise ConfigError(
-            f"{run.path}: no trial reached the full budget of {study.training.updates} updates; "
-            "add random trials or lower search.grace_updates."
-        )
+def _challengers(session: Session) -> list[Finalist]:
+    """The configurations that challenge the baseline; none where only the baseline reached the full budget."""
+    baseline, records = session.space.baseline, session.run.trials()
+    completed = [record for record in records if record.outcome == "completed" and record.parameters != baseline]
+    cost = {record.id: _flops(record, session.study, session.problem) for record in completed}
+    chosen = choose_finalists(completed, cost, session.study.finalists.count)
     return [Finalist(id=record.id, parameters=record.parameters) for record in chosen]
 
 
@@ -114,64 +110,42 @@ def _flops(record: TrialRecord, study: StudyConfig, problem: Problem) -> float:
     return flops_per_particle(problem.build_model(network, 0), problem.valid_samples[0].inputs)
 
 
-def _summarize(study: StudyConfig, dataset: Dataset, problem: Problem, run: RunFolder, progress: Progress) -> dict:
-    retrainings = finished_retrainings(run)
-    checkpoints = {finalist: checkpoint_of(run, finalist, records) for finalist, records in retrainings.items()}
+def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
+    study, problem, run = session.study, session.problem, session.run
+    finalists, failed = retrained_finalists(run, study.finalists.seeds)
+    if not finalists:
+        ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
+        raise ConfigError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
     test_samples = list(progress(study_samples(study, dataset, "test"), "test"))
     tests = {
-        finalist: evaluate_finalist(run, finalist, records, test_samples, study.finalists.frames_per_block)
-        for finalist, records in progress(list(retrainings.items()), "test errors")
+        finalist.id: evaluate_finalist(finalist, test_samples, study.finalists.frames_per_block)
+        for finalist in progress(finalists, "test errors")
     }
     inputs = [sample.inputs for sample in problem.valid_samples[:5]]
+    checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     costs = measure_costs(checkpoints, load_model, inputs, threads=study.cost.threads, repeats=study.cost.repeats)
-    entries = [
-        finalist_entry(finalist, records, tests[finalist], costs[finalist], checkpoints[finalist], run)
-        for finalist, records in retrainings.items()
-    ]
-    for finalist, records in retrainings.items():
-        _complete_cards(run, finalist, records, tests[finalist])
+    environment = run.read("environment.json")
+    for finalist in finalists:
+        complete_cards(finalist, tests[finalist.id], environment)
     chosen, reason = recommend(
-        {finalist: [best_valid_error(record) for record in records] for finalist, records in retrainings.items()},
-        {finalist: cost.ms_per_frame for finalist, cost in costs.items()},
+        {finalist.id: finalist.valid_errors for finalist in finalists},
+        {finalist.id: costs[finalist.id].ms_per_frame for finalist in finalists},
     )
+    frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
+    retrainings = [record for records in run.retrainings().values() for record in records]
     return {
         "study": study.name,
         "task": study.task,
-        "dataset": {
-            "path": str(dataset.path),
-            "scene": dataset.scene.name,
-            "frames": {
-                "train": len(problem.train_samples),
-                "valid": len(problem.valid_samples),
-                "test": len(test_samples),
-            },
-        },
+        "dataset": {"path": str(dataset.path), "scene": dataset.scene.name, "frames": frames},
         "baseline": BASELINE,
-        "finalists": entries,
+        "finalists": [finalist_entry(each, tests[each.id], costs[each.id], run) for each in finalists],
+        "failed_finalists": failed,
         "pareto_front": pareto_front(
-            {entry["id"]: (entry["test"]["normalized_mse"], entry["cost"]["ms_per_frame"]) for entry in entries}
+            {each.id: (tests[each.id]["normalized_mse"], costs[each.id].ms_per_frame) for each in finalists}
         ),
         "recommended": {"id": chosen, "reason": reason},
-        "trials": count_outcomes(run.trials()),
+        "trials": count_outcomes([*run.trials(), *retrainings]),
     }
-
-
-def _complete_cards(run: RunFolder, finalist: str, records: Sequence[TrialRecord], test: dict) -> None:
-    """Add the test errors and where the model comes from to the card beside each retrained model."""
-    environment = run.read("environment.json")
-    for record in records:
-        folder = run.path / "finalists" / finalist / record.id / "checkpoint"
-        card = read_card(folder) | {
-            "finalist": finalist,
-            "test": {
-                "normalized_mse": test["by_seed"][record.id],
-                "mean_over_seeds": test["normalized_mse"],
-                "ci95": test["ci95"],
-            },
-            "data_sha256": environment["data"]["sha256"],
-            "git_commit": environment["git_commit"],
-        }
-        save_model(load_model(folder), folder, card)
 
 
 def count_outcomes(records: Sequence[TrialRecord]) -> dict[str, dict[str, int]]:

@@ -1,7 +1,5 @@
 """How trials end, from Ray into our records and to the observer."""
 
-from collections.abc import Callable
-
 from ray import tune
 
 from cconv.study.observer import Observer
@@ -13,12 +11,13 @@ class Recorder(tune.Callback):
 
     Args:
         observer: Sees the trials as they run.
-        folder_of: Folder of a trial by name.
+        job_of: A trial's name and Ray's parameters to its `Job`.
+        stage: Stage of the trials.
         max_updates: Full budget; a trial that ends before it was stopped.
     """
 
-    def __init__(self, observer: Observer, folder_of: Callable[[str], TrialFolder], max_updates: int):
-        self._observer, self._folder_of, self._max_updates = observer, folder_of, max_updates
+    def __init__(self, observer: Observer, job_of, stage: str, max_updates: int):
+        self._observer, self._job_of, self._stage, self._max_updates = observer, job_of, stage, max_updates
 
     def __getstate__(self) -> dict:
         """Nothing: Ray pickles callbacks to restore a run from its own files, which we never do."""
@@ -26,11 +25,12 @@ class Recorder(tune.Callback):
 
     def on_trial_start(self, iteration, trials, trial, **info) -> None:
         """A trial begins."""
-        self._observer.on_trial_start(str(trial), trial.config)
+        self._observer.on_trial_start(str(trial), self._job(trial).parameters)
 
     def on_trial_result(self, iteration, trials, trial, result, **info) -> None:
         """A trial was evaluated."""
-        self._observer.on_trial_result(str(trial), result)
+        shown = result | {"valid_normalized_mse": None} if result["diverged"] else result
+        self._observer.on_trial_result(str(trial), shown)
 
     def on_trial_complete(self, iteration, trials, trial, **info) -> None:
         """A trial reached its budget, was stopped, or diverged."""
@@ -40,9 +40,16 @@ class Recorder(tune.Callback):
 
     def on_trial_error(self, iteration, trials, trial, **info) -> None:
         """A trial raised, or its process died."""
-        lines = str(trial.get_error() or "its process died").strip().splitlines()
-        self._end(trial, "failed", lines[-1] if lines else "")
+        self._end(trial, "failed", TrialFolder(self._job(trial).folder).reason or "its process died")
+
+    def _job(self, trial):
+        return self._job_of(str(trial), trial.config)
 
     def _end(self, trial, outcome: str, reason: str) -> None:
-        self._folder_of(str(trial)).finish(outcome, reason)
+        job = self._job(trial)
+        folder = TrialFolder(job.folder)
+        if not folder.started:  # it failed before it could say what it is
+            known = {"stage": self._stage, "parameters": job.parameters, "init_seed": job.init_seed}
+            folder.start(known | {"num_parameters": None})
+        folder.finish(outcome, reason)
         self._observer.on_trial_end(str(trial), outcome, reason)

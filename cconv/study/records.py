@@ -10,6 +10,8 @@ from pathlib import Path
 from cconv.errors import ConfigError, DataError
 
 SEARCHES = ("random", "adaptive")
+# Ray and Optuna need a finite number where a trial diverged; our records hold none there.
+DIVERGED_ERROR = 1e9
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
 
 
@@ -17,8 +19,11 @@ def write_json(path: Path, value) -> None:
     """Write JSON under a temporary name, then rename, so that a reader never finds half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}-{os.getpid()}")
-    part.write_text(json.dumps(value, indent=2) + "\n")
-    os.replace(part, path)
+    try:
+        part.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def read_json(path: Path):
@@ -41,10 +46,10 @@ class TrialRecord:
 
     Attributes:
         id: Name of its folder.
-        stage: "random", "adaptive" or "finalists".
+        stage: "random", "adaptive", "finalists" or "train".
         parameters: Hyperparameters that were drawn.
         config: Resolved network and training settings, seeds, number of parameters.
-        log: One entry an evaluation: updates, train_loss, valid_normalized_mse, learning_rate, seconds.
+        log: One entry an evaluation: updates, train_loss, valid_normalized_mse, learning_rate, seconds, diverged.
         outcome: One of `OUTCOMES`; "interrupted" if the run ended before the trial did.
         reason: Why it failed, or "".
     """
@@ -71,10 +76,16 @@ class TrialFolder:
         self.path = path
         self.checkpoint = path / "checkpoint"
 
+    @property
+    def started(self) -> bool:
+        """Whether the configuration has been written."""
+        return (self.path / "config.json").is_file()
+
     def start(self, config: Mapping) -> None:
-        """Write the configuration; the log begins empty."""
-        write_json(self.path / "config.json", config)
+        """Begin an empty log, then write the configuration, by which a reader knows that there is a trial."""
+        self.path.mkdir(parents=True, exist_ok=True)
         (self.path / "log.jsonl").write_text("")
+        write_json(self.path / "config.json", config)
 
     def append(self, entry: Mapping) -> None:
         """Add one line to the log."""
@@ -85,13 +96,21 @@ class TrialFolder:
         """Record how the trial ended."""
         write_json(self.path / "outcome.json", {"outcome": outcome, "reason": reason})
 
+    @property
+    def reason(self) -> str:
+        """Why the trial failed, as far as it could say; else ""."""
+        return self._end()["reason"]
+
+    def _end(self) -> dict:
+        ended = self.path / "outcome.json"
+        return read_json(ended) if ended.is_file() else {"outcome": "interrupted", "reason": ""}
+
     def read(self) -> TrialRecord:
         """Everything that was recorded; a log line cut short by a kill is left out."""
         config = read_json(self.path / "config.json")
         lines = (self.path / "log.jsonl").read_text().splitlines()
         log = [json.loads(line) for line in lines if line.endswith("}")]
-        ended = self.path / "outcome.json"
-        end = read_json(ended) if ended.is_file() else {"outcome": "interrupted", "reason": ""}
+        end = self._end()
         return TrialRecord(
             id=self.path.name,
             stage=config["stage"],
@@ -104,7 +123,7 @@ class TrialFolder:
 
 
 class RunFolder:
-    """A study's folder ``runs/<study>/``; layout in DESIGN's section "Files"."""
+    """A study's folder ``runs/<study>/``; the README says what it holds."""
 
     def __init__(self, path: Path | str):
         self.path = Path(path)

@@ -2,26 +2,25 @@
 
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from cconv.study.config import StudyConfig, TrainingConfig
 from cconv.study.observer import Observer
 from cconv.study.problem import Problem, provenance
-from cconv.study.records import RunFolder, TrialFolder
+from cconv.study.records import DIVERGED_ERROR, RunFolder, TrialFolder
 from cconv.study.space import SearchSpace, optuna_distributions, ray_domains
 
 METRIC = "valid_normalized_mse"
-# Ray and Optuna need a finite number where a trial diverged; our records hold none there.
-DIVERGED_ERROR = 1e9
+RAY_OBJECT_STORE_BYTES = 2**30
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One training of a list.
+    """One training.
 
     Attributes:
         folder: Where it is recorded.
@@ -36,9 +35,33 @@ class Job:
     init_seed: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """What all stages of a run share.
+
+    Attributes:
+        study: The study.
+        space: Its search space.
+        problem: Scene, task and samples.
+        run: Where everything is recorded.
+        observer: Sees the trials as they run.
+    """
+
+    study: StudyConfig
+    space: SearchSpace
+    problem: Problem
+    run: RunFolder
+    observer: Observer
+
+    @property
+    def ray_folder(self) -> Path:
+        """Ray's own files, which nothing of ours reads."""
+        return self.run.path.absolute() / "ray"
+
+
 @contextmanager
-def ray_session(concurrency: int) -> Iterator[Path]:
-    """A private Ray on this machine with one core a trial; yields the folder of its disposable files."""
+def ray_session(session: Session) -> Iterator[None]:
+    """A private Ray on this machine with one core a trial; its files go when it ends."""
     os.environ.update(
         RAY_AUTH_MODE="disabled",  # tokens would be written to the home folder
         RAY_USAGE_STATS_ENABLED="0",
@@ -52,43 +75,39 @@ def ray_session(concurrency: int) -> Iterator[Path]:
     )
     import ray
 
-    storage = Path(tempfile.mkdtemp(prefix="cconv-ray-"))
     try:
         ray.init(
-            num_cpus=concurrency,
+            num_cpus=session.study.concurrency,
             include_dashboard=False,
             log_to_driver=False,
             logging_level="ERROR",
-            object_store_memory=512 * 2**20,
+            object_store_memory=RAY_OBJECT_STORE_BYTES,
         )
-        yield storage
+        yield
     finally:
         ray.shutdown()
-        shutil.rmtree(storage, ignore_errors=True)
+        shutil.rmtree(session.ray_folder, ignore_errors=True)
 
 
-def random_search(
-    study: StudyConfig, space: SearchSpace, problem: Problem, run: RunFolder, storage: Path, observer: Observer
-) -> None:
+def random_search(session: Session) -> None:
     """Random search with ASHA, the baseline first."""
     from ray.tune.search.basic_variant import BasicVariantGenerator
 
-    num_trials = study.search.random_trials
-    sampler = BasicVariantGenerator(points_to_evaluate=[space.baseline], random_state=study.seeds.search)
-    _search("random", num_trials, sampler, ray_domains(space), study, problem, run, storage, observer)
+    seed = session.study.seeds.search
+    sampler = BasicVariantGenerator(points_to_evaluate=[session.space.baseline], random_state=seed)
+    _search(session, "random", session.study.search.random_trials, sampler, ray_domains(session.space))
 
 
-def adaptive_search(
-    study: StudyConfig, space: SearchSpace, problem: Problem, run: RunFolder, storage: Path, observer: Observer
-) -> None:
+def adaptive_search(session: Session) -> None:
     """Tree-structured Parzen estimator (Optuna) with ASHA, the baseline first; it knows the random trials' errors."""
     from optuna.samplers import TPESampler
 
     from cconv.study.asha import RungAwareOptunaSearch
     from cconv.study.optuna_mirror import mirror_trials, open_journal
 
-    storage_of_study = open_journal(run.path / "optuna.journal")
-    mirror_trials(run.trials(), space, study.training.updates, storage_of_study, study.name)
+    study, space = session.study, session.space
+    journal = open_journal(session.run.path / "optuna.journal")
+    mirror_trials(session.run.trials(), space, study.training.updates, journal, study.name)
     sampler = RungAwareOptunaSearch(
         optuna_distributions(space),
         metric=METRIC,
@@ -96,25 +115,37 @@ def adaptive_search(
         points_to_evaluate=[space.baseline],
         sampler=TPESampler(seed=study.seeds.search, multivariate=True, constant_liar=True),
         study_name=study.name,
-        storage=storage_of_study,
+        storage=journal,
         max_updates=study.training.updates,
     )
-    _search("adaptive", study.search.adaptive_trials, sampler, {}, study, problem, run, storage, observer)
+    _search(session, "adaptive", study.search.adaptive_trials, sampler, {})
 
 
-def _search(
-    stage: str, num_trials: int, sampler, param_space: dict, study: StudyConfig, problem: Problem, run: RunFolder,
-    storage: Path, observer: Observer,
-) -> None:  # fmt: skip
-    from ray import tune
+def run_jobs(session: Session, jobs: Sequence[Job], stage: str, training: TrainingConfig) -> None:
+    """Train every job to the full budget of `training`."""
+    from ray.tune.schedulers import FIFOScheduler
+    from ray.tune.search.basic_variant import BasicVariantGenerator
 
+    jobs = list(jobs)
+    session.observer.on_stage(stage, len(jobs), training.updates)
+    _fit(
+        session,
+        stage,
+        training,
+        job_of=lambda name, parameters: jobs[parameters["job"]],
+        name_of=lambda trial: jobs[trial.config["job"]].name,
+        param_space={"job": _grid(range(len(jobs)))},
+        metric={"metric": METRIC, "mode": "min"},
+        num_samples=1,
+        scheduler=FIFOScheduler(),
+        search_alg=BasicVariantGenerator(),
+    )
+
+
+def _search(session: Session, stage: str, num_trials: int, sampler, param_space: dict) -> None:
     from cconv.study.asha import RecordedASHA
-    from cconv.study.recorder import Recorder
 
-    def trainable(parameters: dict, shared: dict) -> None:
-        name = tune.get_context().get_trial_name()
-        _report(parameters, shared["run"].trial(name), stage, study.seeds.init, **shared["common"])
-
+    study, run = session.study, session.run
     scheduler = RecordedASHA(
         run.path / "rungs.json",
         stage,
@@ -124,97 +155,102 @@ def _search(
         metric=METRIC,
         give_up_above=study.search.give_up_above,
     )
-    observer.on_stage(stage, num_trials, study.training.updates)
-    shared = {"run": run, "common": _common(study, study.training, problem)}
-    callback = Recorder(observer, run.trial, study.training.updates)
+    init_seed, numbers = study.seeds.init, count()
+
+    def job_of(name: str, parameters: dict) -> Job:
+        return Job(folder=run.trial(name).path, name=name, parameters=parameters, init_seed=init_seed)
+
+    session.observer.on_stage(stage, num_trials, study.training.updates)
     _fit(
-        tune.with_parameters(trainable, shared=shared), param_space, stage, num_trials, scheduler, sampler, callback,
-        study.concurrency, storage,
-    )  # fmt: skip
+        session,
+        stage,
+        study.training,
+        job_of=job_of,
+        name_of=lambda trial: f"{stage}_{next(numbers):04d}",
+        param_space=param_space,
+        metric={},  # the scheduler and the sampler have it
+        num_samples=num_trials,
+        scheduler=scheduler,
+        search_alg=sampler,
+    )
 
 
-def run_jobs(
-    jobs: Sequence[Job],
+def _fit(
+    session: Session,
     stage: str,
-    study: StudyConfig,
     training: TrainingConfig,
-    problem: Problem,
-    storage: Path,
-    observer: Observer,
+    *,
+    job_of: Callable[[str, dict], Job],
+    name_of: Callable[..., str],
+    param_space: dict,
+    metric: dict,
+    **tune_settings,
 ) -> None:
-    """Train every job to the full budget of `training`."""
     from ray import tune
-    from ray.tune.schedulers import FIFOScheduler
-    from ray.tune.search.basic_variant import BasicVariantGenerator
 
     from cconv.study.recorder import Recorder
 
+    study = session.study
+
     def trainable(parameters: dict, shared: dict) -> None:
-        job = shared["jobs"][parameters["job"]]
-        _report(job.parameters, TrialFolder(job.folder), stage, job.init_seed, **shared["common"])
+        job = shared["job_of"](tune.get_context().get_trial_name(), parameters)
+        _train_and_report(job, stage, training, shared["problem"], shared["study"])
 
-    observer.on_stage(stage, len(jobs), training.updates)
-    folders = {job.name: TrialFolder(job.folder) for job in jobs}
-    callback = Recorder(observer, folders.__getitem__, training.updates)
-    shared = {"jobs": list(jobs), "common": _common(study, training, problem)}
-    _fit(
-        tune.with_parameters(trainable, shared=shared), {"job": tune.grid_search(list(range(len(jobs))))}, stage, 1,
-        FIFOScheduler(), BasicVariantGenerator(), callback, study.concurrency, storage,
-        names=[job.name for job in jobs],
-    )  # fmt: skip
+    shared = {"job_of": job_of, "problem": session.problem, "study": study}
+    tuner = tune.Tuner(
+        tune.with_resources(tune.with_parameters(trainable, shared=shared), {"cpu": 1}),
+        param_space=param_space,
+        tune_config=tune.TuneConfig(
+            max_concurrent_trials=study.concurrency,
+            reuse_actors=True,
+            trial_name_creator=name_of,
+            trial_dirname_creator=lambda trial: trial.trial_id,
+            **metric,
+            **tune_settings,
+        ),
+        run_config=tune.RunConfig(
+            name=stage,
+            storage_path=str(session.ray_folder),
+            callbacks=[Recorder(session.observer, job_of, stage, training.updates)],
+            progress_reporter=_silent_reporter(),
+            verbose=0,
+        ),
+    )
+    tuner.fit()
 
 
-def _common(study: StudyConfig, training: TrainingConfig, problem: Problem) -> dict:
-    return {
-        "problem": problem,
-        "network": study.network,
-        "training": training,
-        "data_seed": study.seeds.data,
-        "provenance": provenance(study),
-    }
-
-
-def _report(parameters: dict, folder: TrialFolder, stage: str, init_seed: int, **common) -> None:
+def _train_and_report(job: Job, stage: str, training: TrainingConfig, problem: Problem, study: StudyConfig) -> None:
     import torch
     from ray import tune
 
     from cconv.study.trial import run_trial
 
     torch.set_num_threads(1)
+    cache_megabytes = training.cache_megabytes // study.concurrency
+    folder = TrialFolder(job.folder)
     trial = run_trial(
-        common["problem"], parameters, common["network"], common["training"], folder,
-        stage=stage, init_seed=init_seed, data_seed=common["data_seed"], provenance=common["provenance"],
-    )  # fmt: skip
-    for entry in trial:
-        tune.report(entry | {METRIC: DIVERGED_ERROR if entry["diverged"] else entry[METRIC]})
+        problem,
+        job.parameters,
+        study.network,
+        training.model_copy(update={"cache_megabytes": cache_megabytes}),
+        folder,
+        stage=stage,
+        init_seed=job.init_seed,
+        data_seed=study.seeds.data,
+        provenance=provenance(study),
+    )
+    try:
+        for entry in trial:
+            tune.report(entry | {METRIC: DIVERGED_ERROR if entry["diverged"] else entry[METRIC]})
+    except Exception as error:
+        folder.finish("failed", str(error) or type(error).__name__)
+        raise
 
 
-def _fit(
-    trainable, param_space: dict, stage: str, num_samples: int, scheduler, sampler, callback, concurrency: int,
-    storage: Path, names: Sequence[str] | None = None,
-) -> None:  # fmt: skip
+def _grid(values):
     from ray import tune
 
-    count = iter(range(10**9))
-    tuner = tune.Tuner(
-        tune.with_resources(trainable, {"cpu": 1}),
-        param_space=param_space,
-        tune_config=tune.TuneConfig(
-            metric=None if hasattr(scheduler, "_metric") else METRIC,
-            mode=None if hasattr(scheduler, "_metric") else "min",
-            search_alg=sampler,
-            scheduler=scheduler,
-            num_samples=num_samples,
-            max_concurrent_trials=concurrency,
-            reuse_actors=True,
-            trial_name_creator=lambda trial: names[next(count)] if names else f"{stage}_{next(count):04d}",
-            trial_dirname_creator=lambda trial: trial.trial_id,
-        ),
-        run_config=tune.RunConfig(
-            name=stage, storage_path=str(storage), callbacks=[callback], verbose=0, progress_reporter=_silent_reporter()
-        ),
-    )
-    tuner.fit()
+    return tune.grid_search(list(values))
 
 
 def _silent_reporter():

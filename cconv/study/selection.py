@@ -26,11 +26,10 @@ def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
 def choose_finalists(records: Sequence[TrialRecord], cost: Mapping[str, float], count: int) -> list[TrialRecord]:
     """The `count` most accurate configurations among those that none is both more accurate and cheaper than.
 
-    Only trials of the full budget compete, by their last validation error; the first baseline is left out, since it is
-    retrained anyway.
+    Only trials of the full budget compete, by their last validation error.
 
     Args:
-        records: Trials of the search; the baseline's too.
+        records: Trials of the search.
         cost: Estimated cost of each trial by id, e.g. FLOPs per particle.
         count: Number of finalists.
     """

@@ -19,8 +19,8 @@ WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
 def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
     """Write a model: `model.safetensors`, `config.json`, `card.json`.
 
-    The files are written to a temporary folder that then takes the place of `folder`, so that a reader finds the old
-    model or the new one.
+    The files are written to a temporary folder that then takes the place of `folder`, so that a reader never finds half
+    a model.
 
     Args:
         model: Model to save.
@@ -29,18 +29,20 @@ def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
     """
     folder = Path(folder)
     fresh = folder.with_name(f".{folder.name}-{os.getpid()}")
+    old = folder.with_name(f"{fresh.name}-old")
+    for rest in (fresh, old):
+        shutil.rmtree(rest, ignore_errors=True)
     fresh.mkdir(parents=True)
     try:
         save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
         (fresh / CONFIG).write_text(model.config.model_dump_json(indent=2))
-        (fresh / CARD).write_text(json.dumps(card, indent=2))
-        old = folder.with_name(f".{folder.name}-old")
+        (fresh / CARD).write_text(json.dumps(card, indent=2, allow_nan=False))
         if folder.exists():
             folder.rename(old)
         fresh.rename(folder)
-        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def load_model(path: Path | str, task: str | None = None) -> FieldModel:

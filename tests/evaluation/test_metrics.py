@@ -6,7 +6,7 @@ from systems import problem
 from cconv.evaluation.metrics import (
     FrameError,
     blocks_of_errors,
-    bootstrap_interval,
+    crossed_interval,
     frame_errors,
     normalized_mse,
     per_frame_normalized_mse,
@@ -57,19 +57,37 @@ def test_units_are_time_blocks_of_a_single_trajectory():
     np.testing.assert_allclose(blocks_of_errors(errors[:2], 5), [0.5])
 
 
-def test_interval_holds_the_mean_and_shrinks_to_a_constant():
-    table = np.random.default_rng(0).lognormal(size=(4, 6))
-    low, high = bootstrap_interval(table)
-    assert low < table.mean() < high
-    assert bootstrap_interval(np.full((2, 3), 0.5)) == (0.5, 0.5)
+def test_frames_with_a_constant_target_do_not_count_in_the_per_frame_error():
+    undefined = FrameError(trajectory="0", frame=0, num_particles=10, normalized_mse=1.0, per_frame_normalized_mse=None)
+    assert per_frame_normalized_mse([undefined, error(0.5)]) == 0.5
+    assert per_frame_normalized_mse([undefined]) is None
 
 
-def test_interval_covers_the_true_mean_about_as_often_as_it_says():
-    """Crossed normal effects with known mean 0; small tables make a percentile bootstrap a little too narrow."""
+def test_interval_is_positive_holds_the_mean_and_shrinks_to_a_constant():
+    table = np.random.default_rng(0).lognormal(size=(3, 4))
+    low, high = crossed_interval(table, table.mean())
+    assert 0 < low < table.mean() < high
+    assert crossed_interval(np.full((2, 3), 0.5), 0.5) == (0.5, 0.5)
+
+
+def test_interval_of_a_single_unit_covers_the_seeds():
+    low, high = crossed_interval(np.array([[1.0], [1.1], [1.2]]), 1.1)
+    assert low < 1.0
+    assert high > 1.2
+
+
+@pytest.mark.parametrize(("seeds", "units"), [(2, 1), (2, 3), (3, 3), (3, 4), (5, 12)])
+def test_interval_covers_the_true_mean_as_often_as_it_says(seeds, units):
+    """Crossed normal effects of 10 % around a known mean, at the sizes that studies use."""
     rng = np.random.default_rng(1)
     covered = 0
-    for repeat in range(200):
-        table = rng.normal(size=(12, 1)) + rng.normal(size=(1, 12)) + rng.normal(size=(12, 12))
-        low, high = bootstrap_interval(table, resamples=400, seed=repeat)
-        covered += low <= 0 <= high
-    assert 0.85 <= covered / 200 <= 0.99
+    for _ in range(600):
+        effects = (
+            rng.normal(size=(seeds, 1)),
+            rng.normal(size=(1, units)) * (units > 1),
+            rng.normal(size=(seeds, units)),
+        )
+        table = 1 + 0.1 * sum(effects) / 3
+        low, high = crossed_interval(table, table.mean())
+        covered += low <= 1 <= high
+    assert 0.92 <= covered / 600 <= 1

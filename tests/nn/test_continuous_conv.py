@@ -184,6 +184,22 @@ def test_gradients_of_first_and_second_order(message, out_channels, generator):
     assert torch.autograd.gradgradcheck(convolve, inputs)
 
 
+@pytest.mark.parametrize("message", ["absolute", "difference"])
+def test_nothing_is_differentiated_with_respect_to_positions(message, cloud, generator):
+    geometry = ConvGeometry(radius_graph(cloud.requires_grad_(), 0.4), 3)
+    features, filters = normal(generator, 30, 2), normal(generator, 3, 3, 3, 2, 4)
+    assert not continuous_conv(features, filters, geometry, message=message).requires_grad
+
+
+def test_stated_memory_covers_every_matrix(cloud):
+    geometry = ConvGeometry(radius_graph(cloud, 0.4), 6)
+    matrices = [geometry.gather, geometry.gather.transposed, geometry.read, geometry.read.transposed]
+    tensors = [tensor for matrix in matrices for tensor in (matrix.offsets, matrix.columns, matrix.values)]
+    own = [geometry.cell_sums, geometry.cells, geometry.weights, geometry.receivers, geometry.senders]
+    needed = sum(tensor.nbytes for tensor in [*tensors, *own])
+    assert 0.7 * geometry.nbytes < needed <= geometry.nbytes + 64
+
+
 def test_float32_agrees_with_float64(cloud, generator):
     features, filters = normal(generator, 30, 3), normal(generator, 4, 4, 4, 3, 2)
     expected = continuous_conv(features, filters, ConvGeometry(radius_graph(cloud, 0.4), 4))

@@ -62,6 +62,17 @@ def test_report_opens_without_a_network_and_states_the_figures(run):
         assert f"{entry['test']['normalized_mse']:.4g}" in page
 
 
+def test_a_run_whose_baseline_failed_has_a_report_that_says_so(run, tmp_path):
+    shutil.copytree(run.path, tmp_path / "lame")
+    summary = run.read("summary.json")
+    summary["finalists"] = [entry for entry in summary["finalists"] if entry["id"] != "baseline"]
+    other = summary["finalists"][0]["id"]
+    summary |= {"pareto_front": [other], "recommended": {"id": other, "reason": "alone"}}
+    summary["failed_finalists"] = {"baseline": "seed_1 failed out of memory"}
+    (tmp_path / "lame" / "summary.json").write_text(json.dumps(summary))
+    assert "seed_1 failed out of memory" in write_report(RunFolder.open(tmp_path / "lame")).read_text()
+
+
 def test_an_interrupted_run_has_a_report_too(run, tmp_path):
     shutil.copytree(run.path, tmp_path / "cut")
     (tmp_path / "cut" / "summary.json").unlink()

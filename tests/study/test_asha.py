@@ -83,10 +83,10 @@ def search():
 
 def test_optuna_hears_pruned_below_the_full_budget_and_complete_at_it(search):
     search.suggest("stopped")
-    search.on_trial_complete("stopped", {"error": 0.5, "updates": 3})
+    search.on_trial_complete("stopped", {"error": 0.5, "updates": 3, "diverged": False})
     search.suggest("full")
     search.on_trial_result("full", {"error": 0.4, "updates": 9})
-    search.on_trial_complete("full", {"error": 0.2, "updates": 27})
+    search.on_trial_complete("full", {"error": 0.2, "updates": 27, "diverged": False})
     search.suggest("crashed")
     search.on_trial_complete("crashed", error=True)
     stopped, full, crashed = search._ot_study.trials
@@ -94,6 +94,19 @@ def test_optuna_hears_pruned_below_the_full_budget_and_complete_at_it(search):
     assert stopped.intermediate_values == {3: 0.5}
     assert (full.state, full.value, full.intermediate_values) == (TrialState.COMPLETE, 0.2, {9: 0.4})
     assert crashed.state == TrialState.FAIL
+
+
+def test_diverging_at_the_full_budget_is_not_complete(search):
+    search.suggest("late")
+    search.on_trial_complete("late", {"error": 1e9, "updates": 27, "diverged": True})
+    assert search._ot_study.trials[0].state == TrialState.PRUNED
+
+
+def test_a_second_completion_changes_nothing(search):
+    search.suggest("twice")
+    for _ in range(2):
+        search.on_trial_complete("twice", {"error": 0.5, "updates": 3, "diverged": False})
+    assert search._ot_study.trials[0].intermediate_values == {3: 0.5}
 
 
 def test_no_trial_is_left_running(search):

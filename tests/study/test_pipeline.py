@@ -1,9 +1,11 @@
 """One whole study of the smallest size, looked at from all sides."""
 
 import json
+import subprocess
 
 import optuna
 import pytest
+from conftest import SCRIPT, SMOKE
 
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
@@ -34,7 +36,8 @@ def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
     records = run.trials()
     assert len(records) == 6
     assert all(record.outcome in ("completed", "stopped", "diverged") for record in records)
-    assert sum(sum(counts.values()) for counts in summary["trials"].values()) == 6
+    counts = {stage: sum(outcomes.values()) for stage, outcomes in summary["trials"].items()}
+    assert counts == {"random": 3, "adaptive": 3, "finalists": 4}
 
 
 def test_all_trials_share_data_seed_and_differ_in_nothing_else_than_parameters(run):
@@ -102,3 +105,32 @@ def test_optunas_journal_holds_both_searches_and_no_trial_without_an_end(run):
 def test_nothing_half_written_remains(run):
     assert [path for path in run.path.rglob(".*")] == []
     assert json.loads((run.path / "state.json").read_text())["state"] == "finished"
+
+
+SPACE_WITH_FAILURES = """
+name = "failures"
+description = "Half of the cutoffs reach farther than half of the periodic box, which no neighbour search can do."
+
+[parameters.relative_cutoff]
+type = "choice"
+values = [2.0, 6.0]
+baseline = 2.0
+reason = "The second fails."
+"""
+
+
+def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp_path):
+    """With no challenger at the full budget left, the baseline alone is compared and recommended."""
+    (tmp_path / "space.toml").write_text(SPACE_WITH_FAILURES)
+    command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", tmp_path / "run"]
+    settings = [f"search.space={tmp_path / 'space.toml'}", "search.random_trials=6", "search.adaptive_trials=0"]
+    options = [part for setting in settings for part in ("--set", setting)]
+    finished = subprocess.run([*command, *options], capture_output=True, text=True, timeout=200)
+    assert finished.returncode == 0, finished.stderr
+    run = RunFolder.open(tmp_path / "run")
+    failed = [record for record in run.trials() if record.outcome == "failed"]
+    assert {record.parameters["relative_cutoff"] for record in failed} == {6.0}
+    assert all("half of every periodic axis" in record.reason for record in failed)
+    summary = run.read("summary.json")
+    assert summary["trials"]["random"]["failed"] == len(failed) >= 1
+    assert summary["recommended"]["id"] == "baseline"
