@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 
+import h5py
 import pytest
 from conftest import SCRIPT, SMOKE
 
@@ -79,6 +80,46 @@ def test_an_unknown_key_in_a_search_space_is_named(cconv, flow_folder, tmp_path)
     settings = ("--set", f"search.space={tmp_path / 'space.toml'}")
     outcome = cconv("study", "run", SMOKE, "--data", flow_folder, *settings, "--out", tmp_path / "run")
     assert_one_clear_line(outcome, "space.toml", "reson", "Did you mean 'reason'")
+
+
+def test_data_that_turn_out_damaged_leave_no_run_folder_or_training(cconv, flow_folder, tmp_path):
+    shutil.copytree(flow_folder, tmp_path / "nan")
+    with h5py.File(tmp_path / "nan" / "valid.h5", "r+") as file:
+        file["00000"]["position"][1, 2, 0] = float("nan")
+    for command in (("study", "run", SMOKE), ("train", SMOKE)):
+        outcome = cconv(*command, "--data", tmp_path / "nan", "--out", tmp_path / "out")
+        assert_one_clear_line(outcome, "valid.h5", "NaN", "frame 1")
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_cutoff_that_the_box_cannot_hold_is_named_and_leaves_nothing(cconv, flow_folder, tmp_path):
+    settings = ("--set", "network.relative_cutoff=9")
+    outcome = cconv("train", SMOKE, "--data", flow_folder, *settings, "--out", tmp_path / "out")
+    assert_one_clear_line(outcome, "half of every periodic axis")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(cconv, flow_folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    outcome = cconv("study", "run", SMOKE, "--data", flow_folder, "--out", tmp_path / "file" / "run")
+    assert_one_clear_line(outcome, "file")
+
+
+def test_damaged_records_are_named(cconv, finished_run, tmp_path):
+    shutil.copytree(finished_run, tmp_path / "run")
+    log = next((tmp_path / "run" / "trials").glob("*/log.jsonl"))
+    log.write_text("{]}\n" + log.read_text())
+    assert_one_clear_line(cconv("report", tmp_path / "run"), "log.jsonl", "delete that line")
+    summary = json.loads((finished_run / "summary.json").read_text())
+    checkpoint = tmp_path / "run" / summary["finalists"][0]["checkpoint"]
+    (checkpoint / "card.json").write_text("{")
+    assert_one_clear_line(cconv("evaluate", checkpoint), "card.json")
+
+
+def test_an_unknown_split_is_named(cconv, finished_run):
+    summary = json.loads((finished_run / "summary.json").read_text())
+    outcome = cconv("evaluate", finished_run / summary["finalists"][0]["checkpoint"], "--split", "tset")
+    assert_one_clear_line(outcome, "tset", "Did you mean 'test'")
 
 
 def test_an_existing_run_is_not_touched(cconv, finished_run, flow_folder):

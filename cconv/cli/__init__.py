@@ -32,5 +32,9 @@ def main() -> None:
     except CConvError as error:
         errors.print(f"cconv: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        errors.print(f"cconv: {place}{error.strerror}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

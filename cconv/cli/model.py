@@ -1,5 +1,6 @@
 """`cconv train`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
-from cconv.errors import ConfigError
+from cconv.errors import CConvError, ConfigError
 
 
 def train(
@@ -41,6 +42,9 @@ def train(
                 data_seed=config.seeds.data, provenance=provenance(config), on_update=bar.on_update,
             )  # fmt: skip
             entries = list(trial)
+    except CConvError:
+        shutil.rmtree(out)
+        raise
     except KeyboardInterrupt:
         folder.finish("interrupted")
         errors.print(f"Interrupted; the best checkpoint so far is {folder.checkpoint}.", soft_wrap=True)

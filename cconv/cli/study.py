@@ -8,6 +8,7 @@ from rich.table import Table
 
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import StudyDisplay
+from cconv.errors import CConvError
 
 # Commands import what they run inside, as torch and ray take seconds to load and `--help` should not.
 
@@ -65,8 +66,13 @@ def run(
     except KeyboardInterrupt:
         errors.print(f"\nInterrupted; everything recorded so far is in {folder.path}.", soft_wrap=True)
         raise
+    except CConvError:
+        if not folder.trials():
+            folder.remove()  # nothing was learned, and the same command shall work once the input is mended
+        raise
     finally:
-        report = write_report(folder)
+        if folder.path.exists():
+            report = write_report(folder)
     results.print(_finalists_table(summary))
     results.print(summary["recommended"]["reason"], highlight=False)
     results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes. Report: {report}", soft_wrap=True)

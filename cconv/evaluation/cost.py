@@ -20,6 +20,8 @@ from cconv.training.field_model import FieldModel
 class Cost:
     """Cost of predicting one frame, neighbour search included.
 
+    The density among the input features is taken as given: a solver has it, and all models share it.
+
     Attributes:
         ms_per_frame: Median time of a frame, ms.
         ms_low: Lower quartile.

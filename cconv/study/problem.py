@@ -12,6 +12,7 @@ from cconv.errors import ConfigError
 from cconv.sph.kernels import kernel_named
 from cconv.study.config import DataConfig, StudyConfig
 from cconv.training.field_model import FieldModel, NetworkConfig, build_field_model
+from cconv.validation import validated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +113,10 @@ def provenance(study: StudyConfig) -> dict:
 
 
 def data_from_card(card: Mapping, path: str | None) -> DataConfig:
-    """Data settings of a checkpoint's card, on another folder if `path` is given."""
+    """Data settings of a checkpoint's card, on another folder if `path` is given.
+
+    Raises:
+        ConfigError: If the card's settings do not fit.
+    """
     settings = card.get("data", {})
-    return DataConfig.model_validate(settings | ({"path": path} if path else {}))
+    return validated(DataConfig, settings | ({"path": path} if path else {}), "card.json, data")

@@ -105,11 +105,20 @@ class TrialFolder:
         ended = self.path / "outcome.json"
         return read_json(ended) if ended.is_file() else {"outcome": "interrupted", "reason": ""}
 
+    def _log(self) -> list[dict]:
+        path = self.path / "log.jsonl"
+        lines = path.read_text().splitlines() if path.is_file() else []
+        if lines and not lines[-1].endswith("}"):
+            lines.pop()
+        try:
+            return [json.loads(line) for line in lines]
+        except json.JSONDecodeError as error:
+            raise DataError(f"{path}: a line is not JSON ({error}); delete that line.") from error
+
     def read(self) -> TrialRecord:
-        """Everything that was recorded; a log line cut short by a kill is left out."""
+        """Everything that was recorded; a last log line cut short by a kill is left out."""
         config = read_json(self.path / "config.json")
-        lines = (self.path / "log.jsonl").read_text().splitlines()
-        log = [json.loads(line) for line in lines if line.endswith("}")]
+        log = self._log()
         end = self._end()
         return TrialRecord(
             id=self.path.name,
@@ -145,6 +154,10 @@ class RunFolder:
                 f"{run.path}: exists already; give another --out, or --overwrite to replace an older run."
             ) from error
         return run
+
+    def remove(self) -> None:
+        """Delete the folder and everything in it."""
+        shutil.rmtree(self.path)
 
     @classmethod
     def open(cls, path: Path | str) -> "RunFolder":

@@ -83,9 +83,18 @@ def load_model(path: Path | str, task: str | None = None) -> FieldModel:
 
 
 def read_card(path: Path | str) -> dict:
-    """Metrics and provenance of a saved model; empty if it has none."""
+    """Metrics and provenance of a saved model; empty if it has none.
+
+    Raises:
+        ConfigError: If the card is damaged.
+    """
     card = Path(path) / CARD
-    return json.loads(card.read_text()) if card.is_file() else {}
+    if not card.is_file():
+        return {}
+    try:
+        return dict(json.loads(card.read_text()))
+    except ValueError as error:
+        raise ConfigError(f"{card}: not a JSON table ({error}); restore or delete it.") from error
 
 
 def _read_config(path: Path) -> FieldConfig:

@@ -20,8 +20,10 @@ from cconv.sph.kernels import kernel_named
 
 
 class NetworkConfig(BaseModel):
-    """Hyperparameters of a ConvNet. The defaults are the published network: 692,902 parameters for 4 inputs, 3 outputs.
+    """Hyperparameters of a ConvNet.
 
+    The defaults have the published layer sizes and filters: 692,902 parameters for 4 inputs and 3 outputs in a scene
+    with normals. Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
     `relative_cutoff` is the filter radius R in particle spacings (published: diameter 0.225 = 1.5·6·0.025 at spacing
     0.05, so R = 2.25 spacings). The layers have `first_channels`, then `hidden_channels`, and the target's components.
     """

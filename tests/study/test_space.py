@@ -34,7 +34,7 @@ def test_every_space_of_the_repository_loads_and_explains_itself(path):
     configure(space.baseline, NetworkConfig(), TrainingConfig())
 
 
-def test_the_density_spaces_baseline_is_the_published_network():
+def test_the_density_spaces_baseline_is_the_default_network_and_training():
     space = load_space(next(path for path in SPACES if path.stem == "density"))
     network, training = configure(space.baseline, NetworkConfig(), TrainingConfig())
     assert network == NetworkConfig()

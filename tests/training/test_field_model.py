@@ -9,7 +9,7 @@ from cconv.training.field_model import NetworkConfig, build_field_model
 SMALL = NetworkConfig(layers=2, first_channels=4, kernel_size=3)
 
 
-def test_defaults_are_the_published_network():
+def test_defaults_have_the_published_sizes_and_filters():
     network = NetworkConfig()
     assert network.layer_channels(3) == (32, 64, 64, 3)
     assert network.relative_cutoff * 0.05 == pytest.approx(0.225 / 2)
