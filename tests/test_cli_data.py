@@ -1,21 +1,12 @@
 import json
 
 import pytest
+from outcomes import assert_one_clear_line
 from particle_files import record_frames, write_hdf5, write_parts
 
 from cconv.data.dataset import open_dataset
 
 SMALL = ["--trajectories", "3", "--frames", "4", "--particles-per-side", "8"]
-
-
-def assert_one_clear_line(outcome, *words):
-    status, out, error = outcome
-    assert status == 2
-    assert out == ""
-    assert error.startswith("cconv: ")
-    assert error.count("\n") == 1
-    assert "Traceback" not in error
-    assert [word for word in words if word not in error] == []
 
 
 def test_generated_set_can_be_inspected(cconv, tmp_path):

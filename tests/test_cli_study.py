@@ -8,17 +8,9 @@ import time
 import h5py
 import pytest
 from conftest import SCRIPT, SMOKE
+from outcomes import assert_one_clear_line
 
 from cconv import load_model
-
-
-def assert_one_clear_line(outcome, *words):
-    status, out, error = outcome
-    assert status == 2
-    assert out == ""
-    assert error.startswith("cconv: ")
-    assert error.count("\n") == 1
-    assert [word for word in words if word not in error] == []
 
 
 def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):

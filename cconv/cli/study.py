@@ -113,7 +113,9 @@ def status(
 
 
 def _finalists_table(summary: dict) -> Table:
-    table = Table(title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left")
+    table = Table(
+        title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left", padding=(0, 0)
+    )
     for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters"):
         table.add_column(name, justify="left" if name == "model" else "right", no_wrap=True)
     for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):

@@ -21,7 +21,7 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
     table = finalists_table(summary).set_index("model")
     recommended = summary["recommended"]["id"]
     figure, axes = _figure(7.5, 5)
-    for name, row in table.iterrows():
+    for number, (name, row) in enumerate(table.iterrows()):
         color = {summary["baseline"]: _BASELINE, recommended: _RECOMMENDED}.get(name, _FINALIST)
         error, ms = row["normalized_mse"], row["ms_per_frame"]
         axes.errorbar(
@@ -39,7 +39,7 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
         axes.annotate(
             f"{label}\n{row['num_parameters']:,.0f} parameters",
             (ms, error),
-            xytext=(10, 6),
+            xytext=(10, 6) if number % 2 == 0 else (10, -24),
             textcoords="offset points",
             fontsize=8,
             color=color,
