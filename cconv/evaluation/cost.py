@@ -13,6 +13,9 @@ from pathlib import Path
 import torch
 
 from cconv.data.features import Inputs
+from cconv.nn import ContinuousConv
+from cconv.ops import general
+from cconv.ops.filter_reads import FilterReads
 from cconv.training.field_model import FieldModel
 
 
@@ -90,24 +93,24 @@ def measure_costs(
 def flops_per_particle(model: FieldModel, inputs: Inputs) -> float:
     """Multiplications and additions of one particle's prediction, counted from layer sizes and mean neighbours.
 
-    A convolution gathers C_in values into P cells an edge and multiplies K^D · C_in · C_out values a particle; where
-    C_out < C_in, it multiplies first and reads C_out values an edge and cell.
+    A convolution gathers C_in values into 2^D cells an edge and multiplies K^D · C_in · C_out values a particle; where
+    C_out is much smaller than C_in, it multiplies first and reads C_out values an edge and cell.
     """
     geometry = model.geometry(inputs)
     particles = max(inputs.num_particles, 1)
     network = model.network
 
-    def conv_flops(conv, edges_of, senders: int) -> float:
+    def conv_flops(conv: ContinuousConv, reads: FilterReads) -> float:
         in_channels, out_channels = conv.filters.shape[-2:]
-        cells = edges_of.num_cells
-        receivers_or_senders = senders if out_channels < in_channels else particles
-        reads = edges_of.cells.numel() / particles * min(in_channels, out_channels)
-        return 2 * (reads + receivers_or_senders / particles * cells * in_channels * out_channels)
+        multiplies_first = general.multiplies_first(reads.num_senders, reads.num_receivers, in_channels, out_channels)
+        read = len(reads.senders) * reads.num_corners * (out_channels if multiplies_first else in_channels)
+        multiplied = (reads.num_senders if multiplies_first else reads.num_receivers) * conv.filters.numel()
+        return 2 * (read + multiplied) / particles
 
-    total = sum(conv_flops(conv, geometry.fluid, particles) for conv in network.convs)
+    total = sum(conv_flops(conv, geometry.fluid.reads) for conv in network.convs)
     total += sum(2 * dense.weight.numel() for dense in network.dense)
     if network.boundary_conv is not None:
-        total += conv_flops(network.boundary_conv, geometry.boundary, geometry.boundary.num_senders)
+        total += conv_flops(network.boundary_conv, geometry.boundary.reads)
     return float(total)
 
 

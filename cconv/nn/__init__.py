@@ -1,6 +1,19 @@
-"""Networks of continuous convolutions in plain PyTorch."""
+"""Networks of continuous convolutions."""
 
-from cconv.nn.continuous_conv import ContinuousConv, ConvGeometry, continuous_conv
+from cconv.nn.continuous_conv import (
+    AntisymmetricConv,
+    ContinuousConv,
+    ConvGeometry,
+    antisymmetric_filters,
+    continuous_conv,
+)
 from cconv.nn.conv_net import ConvNet
 
-__all__ = ["ContinuousConv", "ConvGeometry", "ConvNet", "continuous_conv"]
+__all__ = [
+    "AntisymmetricConv",
+    "ContinuousConv",
+    "ConvGeometry",
+    "ConvNet",
+    "antisymmetric_filters",
+    "continuous_conv",
+]

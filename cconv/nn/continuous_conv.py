@@ -2,34 +2,45 @@ r"""The continuous convolution.
 
 .. math::
     y_i = b + \frac{1}{\psi_i} \sum_{j \in N(i)} a_R(x_j - x_i)\, K(\Lambda(x_j - x_i))^\top m_{ij},
-    \qquad m_{ij} = f_j \text{ (absolute)} \quad\text{or}\quad f_j - f_i \text{ (difference)}
+    \qquad m_{ij} = f_j + \sigma f_i
+
+with σ = 0 for "absolute", -1 for "difference" and 1 for "sum" messages.
 
 Source: Ummenhofer, Prantl, Thuerey, Koltun, "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020),
 section 3; numerically Open3D's ContinuousConv. Difference messages are ours: D2 and D3 are sums over differences.
+Sums come from Prantl et al., "Guaranteed Conservation of Momentum for Learning Particle-based Fluid Dynamics" (NeurIPS
+2022).
 
 The geometry of a set of edges is computed once and shared by all layers with the same filter settings.
 """
 
 import math
-from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
 from cconv.neighbors import Edges
-from cconv.nn.filters import grid_coordinates, interpolation_weights, map_ball_to_cube, window_values
-from cconv.ops.sparse_rows import SparseRows
+from cconv.nn.filters import (
+    corner_offsets,
+    grid_coordinates,
+    interpolate,
+    map_ball_to_cube,
+    strides,
+    window_values,
+)
+from cconv.ops.convolution import convolve
+from cconv.ops.filter_reads import FilterReads
 
-MESSAGES = ("absolute", "difference")
+MESSAGES = {"absolute": 0, "difference": -1, "sum": 1}
 INITIALIZATIONS = ("xavier_uniform", "open3d", "thesis")
+CENTERS = ("none", "cell", "dense")
 
 
 class ConvGeometry:
     """Where each edge reads the filter grid, and with which weight.
 
-    The filter radius R is the cutoff of the edges. The defaults are the published ConvNet's. As in Open3D, nothing is
-    differentiated with respect to positions.
+    The filter radius R is the cutoff of the edges. The defaults are the published ConvNet's.
 
     Args:
         edges: Pairs of receivers i and senders j.
@@ -39,13 +50,19 @@ class ConvGeometry:
         interpolation: "linear", "nearest_neighbor" or "linear_border".
         align_corners: Whether the outermost cells' centres lie on the faces of the cube.
         normalize: Whether to divide by ψ, the sum of a receiver's window values (thesis eq. 2.31).
+        detach_positions: Whether to hold positions constant, as Open3D does. Otherwise, edges of positions that require
+            gradients make convolutions differentiable with respect to them; these take the slower general path.
 
     Attributes:
-        cells: Filter cells that each edge reads, (E, P), int32.
-        weights: Their weights, window and 1/ψ included, (E, P).
+        kernel_size: Cells along each filter axis.
+        normalize: As given.
+        bipartite: Whether receivers and senders are different points.
+        includes_self: Whether each particle is its own neighbour.
+        reads: Cells and weights of each edge.
 
     Raises:
         ConfigError: If a name is unknown or the kernel size is not positive.
+        ShapeError: If the edges do not fit together or hold values that are not finite.
     """
 
     def __init__(
@@ -57,64 +74,76 @@ class ConvGeometry:
         interpolation: str = "linear",
         align_corners: bool = True,
         normalize: bool = False,
+        detach_positions: bool = False,
     ):
+        _check_edges(edges)
         self.kernel_size = grid_shape(kernel_size, edges.dim)
-        self.row_splits = edges.row_splits
-        self.receivers, self.senders = edges.receivers, edges.senders
-        self.num_senders = edges.num_senders
-        self.bipartite = edges.bipartite
-        sizes = self.kernel_size[::-1]
-        cube = map_ball_to_cube(-edges.displacements / edges.cutoff, mapping)  # Λ takes x_j - x_i
-        cells, weights = interpolation_weights(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
-        importance = window_values((edges.distances / edges.cutoff) ** 2, window)
-        if normalize:
-            importance = importance / _row_sums(importance, edges)[edges.receivers]
-        self.cells, self.weights = cells.int(), (weights * importance[:, None]).detach()
+        self.normalize = normalize
+        self.bipartite, self.includes_self = edges.bipartite, edges.includes_self
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_positions):
+            self.reads = _filter_reads(
+                edges, self.kernel_size, mapping, window, interpolation, align_corners, normalize
+            )
 
     @property
     def num_receivers(self) -> int:
         """Number of receiving points."""
-        return len(self.row_splits) - 1
+        return self.reads.num_receivers
+
+    @property
+    def num_senders(self) -> int:
+        """Number of sending points."""
+        return self.reads.num_senders
 
     @property
     def num_cells(self) -> int:
         """Number of cells of the filter grid, K^D."""
-        return math.prod(self.kernel_size)
+        return self.reads.num_cells
 
     @property
     def nbytes(self) -> int:
-        """Memory in bytes once every matrix has been asked for."""
-        entries, places = self.cells.numel(), (self.num_receivers + self.num_senders) * self.num_cells
-        matrices = 4 * entries * (4 + self.weights.element_size()) + 2 * 4 * places
-        sums = self.num_receivers * self.num_cells * self.weights.element_size()
-        return matrices + sums + sum(t.nbytes for t in (self.cells, self.weights, self.receivers, self.senders))
+        """Memory in bytes, also of what convolutions add on first use."""
+        return self.reads.nbytes
 
-    @cached_property
-    def gather(self) -> SparseRows:
-        """Matrix (receivers · K^D, senders) that gathers features into filter cells."""
-        rows = self.receivers[:, None] * self.num_cells + self.cells
-        columns = self.senders[:, None].expand_as(rows)
-        shape = (self.num_receivers * self.num_cells, self.num_senders)
-        return SparseRows.from_entries(rows.flatten(), columns.flatten(), self.weights.flatten(), shape)
 
-    @cached_property
-    def read(self) -> SparseRows:
-        """Matrix (receivers, senders · K^D) that reads features already multiplied with the filter of each cell."""
-        columns = self.senders[:, None] * self.num_cells + self.cells
-        points = self.cells.shape[1]
-        return SparseRows(
-            (self.row_splits * points).int(),
-            columns.flatten().int(),
-            self.weights.flatten(),
-            self.num_senders * self.num_cells,
+def _filter_reads(
+    edges: Edges,
+    kernel_size: tuple[int, ...],
+    mapping: str,
+    window: str,
+    interpolation: str,
+    align_corners: bool,
+    normalize: bool,
+) -> FilterReads:
+    sizes = kernel_size[::-1]
+    cube = map_ball_to_cube(-edges.displacements / edges.cutoff, mapping)  # Λ takes x_j - x_i
+    lowest, fractions, factor = interpolate(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
+    importance = window_values((edges.distances / edges.cutoff) ** 2, window)
+    if normalize:
+        importance = importance / _row_sums(importance, edges)[edges.receivers]
+    corners = corner_offsets(sizes)[: 2 ** fractions.shape[1]]
+    return FilterReads(
+        row_splits=edges.row_splits,
+        receivers=edges.receivers,
+        senders=edges.senders,
+        cells=sum(stride * lowest[:, axis] for axis, stride in enumerate(strides(sizes))),
+        fractions=fractions,
+        weights=importance * factor,
+        corner_offsets=torch.tensor(corners, dtype=torch.int32),
+        num_cells=math.prod(sizes),
+        num_senders=edges.num_senders,
+    )
+
+
+def _check_edges(edges: Edges) -> None:
+    if not torch.isfinite(edges.displacements).all():
+        raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
+    fits = len(edges.senders) == len(edges.receivers) == len(edges.displacements) == int(edges.row_splits[-1])
+    if not fits or (len(edges) and not 0 <= int(edges.senders.min()) <= int(edges.senders.max()) < edges.num_senders):
+        raise ShapeError(
+            f"`edges` must list pairs among {edges.num_receivers} receivers and {edges.num_senders} senders, got row "
+            "splits or senders beyond that; build them with `radius_graph`."
         )
-
-    @cached_property
-    def cell_sums(self) -> Tensor:
-        """Weights summed over the neighbours in each cell, (receivers, K^D)."""
-        sums = self.weights.new_zeros(self.num_receivers * self.num_cells)
-        rows = self.receivers[:, None] * self.num_cells + self.cells
-        return sums.index_add_(0, rows.flatten(), self.weights.flatten()).reshape(self.num_receivers, self.num_cells)
 
 
 def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:
@@ -139,59 +168,64 @@ def continuous_conv(
 ) -> Tensor:
     """Continuous convolution of `features` with `filters`; equation in the module's docstring.
 
+    On the CPU in float32 or float64, compiled loops over blocks of particles keep memory independent of their number
+    and follow `torch.get_num_threads()`. Other devices and dtypes, derivatives with respect to positions, and second
+    derivatives go through torch operations.
+
     Args:
-        features: Features f of the senders (M, C_in).
+        features: Features f of the senders (M, C_in), finite.
         filters: Filter grid in Open3D's layout (depth, height, width, C_in, C_out), in 2D (height, width, C_in, C_out).
         geometry: Where each edge reads the filter grid.
         bias: (C_out,) or None.
-        message: "absolute" or "difference"; the latter needs receivers and senders to be the same points.
+        message: "absolute", "difference" or "sum"; the latter two need receivers and senders to be the same points.
 
     Returns:
         (N, C_out); a receiver without neighbours gives the bias.
 
     Raises:
-        ShapeError: If shapes, dtypes or devices do not fit together.
+        ShapeError: If shapes, dtypes or devices do not fit together, or a feature is not finite.
         ConfigError: If the message is unknown or not possible.
     """
     _check_inputs(features, filters, geometry, bias, message)
-    in_channels, out_channels = filters.shape[-2:]
-    if out_channels < in_channels:
-        output = _multiply_then_read(features, filters.reshape(-1, in_channels, out_channels), geometry, message)
-    else:
-        output = _gather_then_multiply(features, filters.reshape(-1, out_channels), geometry, message)
+    check_finite("features", features)
+    return _continuous_conv(features, filters, geometry, bias, message)
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """Require finite values; a compiled graph cannot ask, and does not.
+
+    Raises:
+        ShapeError: If a value is NaN or infinite.
+    """
+    if not torch.compiler.is_compiling() and not torch.isfinite(tensor).all():
+        place = [int(index) for index in torch.nonzero(~torch.isfinite(tensor))[0]]
+        raise ShapeError(
+            f"`{name}` must be finite, got {tensor[tuple(place)].item()} at {place}; look for a division by zero or a "
+            "simulation that blew up."
+        )
+
+
+def _continuous_conv(
+    features: Tensor, filters: Tensor, geometry: ConvGeometry, bias: Tensor | None, message: str
+) -> Tensor:
+    output = convolve(features, filters.flatten(0, -3), geometry.reads, MESSAGES[message])
     return output if bias is None else output + bias
-
-
-def _gather_then_multiply(features: Tensor, filters: Tensor, geometry: ConvGeometry, message: str) -> Tensor:
-    columns = (geometry.gather @ features).reshape(geometry.num_receivers, geometry.num_cells, features.shape[1])
-    if message == "difference":
-        columns = columns - geometry.cell_sums[:, :, None] * features[:, None, :]
-    return columns.flatten(1) @ filters
-
-
-def _multiply_then_read(features: Tensor, filters: Tensor, geometry: ConvGeometry, message: str) -> Tensor:
-    num_cells, in_channels, out_channels = filters.shape
-    products = features @ filters.transpose(0, 1).reshape(in_channels, num_cells * out_channels)
-    output = geometry.read @ products.reshape(-1, out_channels)
-    if message == "difference":
-        own = products.reshape(-1, num_cells, out_channels)
-        output = output - torch.einsum("nk,nko->no", geometry.cell_sums, own)
-    return output
 
 
 def _check_inputs(features: Tensor, filters: Tensor, geometry: ConvGeometry, bias: Tensor | None, message: str) -> None:
     check_choice("message", message, MESSAGES)
-    if message == "difference" and geometry.bipartite:
+    if message != "absolute" and geometry.bipartite:
         raise ConfigError("`message` must be 'absolute' where receivers and senders are different points.")
     check_shape("filters", filters.shape, (*geometry.kernel_size, "in_channels", "out_channels"))
     check_shape("features", features.shape, (geometry.num_senders, filters.shape[-2]))
     if bias is not None:
         check_shape("bias", bias.shape, (filters.shape[-1],))
-    for name, tensor in (("features", features), ("filters", filters)):
-        if tensor.dtype != geometry.weights.dtype or tensor.device != geometry.weights.device:
+    expected = geometry.reads.weights
+    for name, tensor in (("features", features), ("filters", filters), ("bias", bias)):
+        if tensor is not None and (tensor.dtype != expected.dtype or tensor.device != expected.device):
             raise ShapeError(
-                f"`{name}` must share dtype and device with the geometry ({geometry.weights.dtype}, "
-                f"{geometry.weights.device}), got {tensor.dtype}, {tensor.device}."
+                f"`{name}` must share dtype and device with the geometry ({expected.dtype}, {expected.device}), "
+                f"got {tensor.dtype}, {tensor.device}."
             )
 
 
@@ -204,10 +238,16 @@ class ContinuousConv(nn.Module):
         kernel_size: Cells of the filter grid, one number or one for each axis.
         dim: Number of space dimensions D.
         bias: Whether to add a learned bias, 0 at first.
-        message: "absolute" or "difference".
+        message: "absolute", "difference" or "sum".
+        center: What a particle adds to its own output besides its neighbours: "none"; "cell", its features through the
+            filter at r = 0 (odd kernel sizes only, and edges without the particle itself); "dense", its features
+            through a learned matrix of their own, as Open3D's `use_dense_layer_for_center`.
         initialization: "xavier_uniform" (thesis; fans count the whole grid), "open3d" (uniform in ±0.05) or "thesis"
             (as "xavier_uniform"; it differs for linear layers only).
         generator: Source of the initial weights; None for torch's global one.
+
+    Raises:
+        ConfigError: If a name is unknown, a size is not positive, or "cell" comes with an even kernel size.
     """
 
     def __init__(
@@ -219,20 +259,94 @@ class ContinuousConv(nn.Module):
         *,
         bias: bool = True,
         message: str = "absolute",
+        center: str = "none",
         initialization: str = "xavier_uniform",
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         check_choice("message", message, MESSAGES)
+        check_choice("center", center, CENTERS)
         check_choice("initialization", initialization, INITIALIZATIONS)
-        self.message = message
         shape = grid_shape(kernel_size, dim)
+        if center == "cell" and not all(size % 2 for size in shape):
+            raise ConfigError(f"`center` 'cell' needs odd kernel sizes, got {shape}; take 'dense' with even ones.")
+        self.message, self.center = message, center
         self.filters = nn.Parameter(torch.empty(*shape, in_channels, out_channels))
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
         fans = math.prod(shape) * (in_channels + out_channels)
         bound = 0.05 if initialization == "open3d" else math.sqrt(6 / fans)
         nn.init.uniform_(self.filters, -bound, bound, generator=generator)
+        self.center_weights = None
+        if center == "dense":
+            self.center_weights = nn.Parameter(torch.empty(in_channels, out_channels))
+            nn.init.xavier_uniform_(self.center_weights, generator=generator)
 
     def forward(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
-        """Features (M, C_in) of the senders to (N, C_out) at the receivers."""
-        return continuous_conv(features, self.filters, geometry, self.bias, self.message)
+        """Features (M, C_in) of the senders to (N, C_out) at the receivers; errors as of `continuous_conv`."""
+        _check_inputs(features, self.filters, geometry, self.bias, self.message)
+        check_finite("features", features)
+        return self.convolve(features, geometry)
+
+    def convolve(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
+        """`forward` without its checks, for hidden layers: what diverged weights make of good inputs passes on."""
+        output = _continuous_conv(features, self.filters, geometry, self.bias, self.message)
+        if self.center == "none":
+            return output
+        if geometry.bipartite or geometry.includes_self:
+            raise ConfigError(
+                f"`center` {self.center!r} needs receivers and senders to be the same points and edges without the "
+                "particle itself (`include_self=False`)."
+            )
+        return output + features @ (self._center_cell if self.center_weights is None else self.center_weights)
+
+    @property
+    def _center_cell(self) -> Tensor:
+        return self.filters[tuple(size // 2 for size in self.filters.shape[:-2])]
+
+
+def antisymmetric_filters(filters: Tensor) -> Tensor:
+    """The part of a filter grid that changes sign at the origin, K(-r) = -K(r); shape (*kernel_size, C_in, C_out)."""
+    return 0.5 * (filters - filters.flip(tuple(range(filters.ndim - 2))))
+
+
+class AntisymmetricConv(nn.Module):
+    """A continuous convolution whose outputs sum to zero over all particles: whatever it moves, momentum is conserved.
+
+    Filters are antisymmetric and messages sums f_j + f_i, so that the contributions of a pair to its two particles are
+    opposite. Without bias.
+
+    Source: Prantl et al., "Guaranteed Conservation of Momentum for Learning Particle-based Fluid Dynamics" (NeurIPS
+    2022), section 3 (the authors store half a grid and mirror it along one axis; the filters are the same).
+
+    Args:
+        in_channels: C_in.
+        out_channels: C_out.
+        kernel_size: Cells of the filter grid, one number or one for each axis.
+        dim: Number of space dimensions D.
+        generator: Source of the initial weights; None for torch's global one.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int | tuple[int, ...],
+        dim: int,
+        *,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        shape = grid_shape(kernel_size, dim)
+        self.filters = nn.Parameter(torch.empty(*shape, in_channels, out_channels))
+        bound = math.sqrt(6 / (math.prod(shape) * (in_channels + out_channels)))
+        nn.init.uniform_(self.filters, -bound, bound, generator=generator)
+
+    def forward(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
+        """Features (N, C_in) to (N, C_out), summing to zero over the particles.
+
+        Raises:
+            ConfigError: If the geometry is normalised, which would weigh the two sides of a pair differently.
+        """
+        if geometry.normalize:
+            raise ConfigError("`geometry` must not be normalised: 1/ψ differs between the two particles of a pair.")
+        return continuous_conv(features, antisymmetric_filters(self.filters), geometry, message="sum")

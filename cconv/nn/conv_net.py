@@ -113,7 +113,7 @@ class ConvNet(nn.Module):
 
     def _layer(self, previous: Tensor, conv: ContinuousConv, dense: nn.Linear, geometry: ConvGeometry) -> Tensor:
         activated = ACTIVATIONS[self.activation](previous)
-        output = conv(activated, geometry) + dense(activated)
+        output = conv.convolve(activated, geometry) + dense(activated)
         if self.skip == "none" or output.shape != previous.shape:
             return output
         return output + (previous if self.skip == "before_activation" else activated)

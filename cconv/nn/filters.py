@@ -39,13 +39,13 @@ def _ball_to_cube_volume_preserving(ball: Tensor) -> Tensor:
 def _ball_to_cylinder(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     rho_squared = x * x + y * y
     norm_squared = rho_squared + z * z
-    norm = norm_squared.sqrt()
+    origin = norm_squared < _TINY
+    norm = torch.where(origin, 1.0, norm_squared).sqrt()
     cap = 1.25 * z * z > rho_squared
-    on_cap = (3 * norm / (norm + z.abs()).clamp_min(_TINY)).sqrt()
-    on_side = norm / rho_squared.sqrt().clamp_min(_TINY)
+    on_cap = (3 * norm / (norm + z.abs())).sqrt()
+    on_side = norm / torch.where(cap | origin, 1.0, rho_squared).sqrt()
     scale = torch.where(cap, on_cap, on_side)
     height = torch.where(cap, torch.sign(z) * norm, 1.5 * z)
-    origin = norm_squared < _TINY
     return tuple(torch.where(origin, 0.0, value) for value in (scale * x, scale * y, height))
 
 
@@ -54,7 +54,7 @@ def _disk_to_square(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     flat = y.abs() <= x.abs()
     longer, shorter = torch.where(flat, x, y), torch.where(flat, y, x)
     origin = rho_squared < _TINY
-    side = torch.sign(longer) * rho_squared.sqrt()
+    side = torch.sign(longer) * torch.where(origin, 1.0, rho_squared).sqrt()
     other = side * (4 / math.pi) * torch.atan(shorter / torch.where(origin, 1.0, longer))
     side, other = torch.where(origin, 0.0, side), torch.where(origin, 0.0, other)
     return torch.where(flat, side, other), torch.where(flat, other, side)
@@ -85,7 +85,7 @@ def map_ball_to_cube(ball: Tensor, mapping: str) -> Tensor:
 
 
 def _cubic_spline_window(squared: Tensor) -> Tensor:
-    q = 2 * squared.sqrt()
+    q = 2 * squared.clamp_min(1e-30).sqrt()  # the root has no derivative at 0
     return torch.where(q < 1, 1 - 1.5 * q**2 + 0.75 * q**3, 0.25 * (2 - q).clamp_min(0) ** 3)
 
 
@@ -129,37 +129,32 @@ def grid_coordinates(cube: Tensor, sizes: tuple[int, ...], align_corners: bool) 
     return (cube + 0.5) * (cells - 1) if align_corners else (cube + 0.5) * cells - 0.5
 
 
-def _nearest_neighbor(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    rounded = torch.trunc(grid + torch.copysign(torch.full_like(grid, 0.5), grid))
-    indices = torch.minimum(rounded.long().clamp_min(0), sizes - 1)
-    return indices[:, None], torch.ones_like(grid)[:, None]
+def _linear(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    lower = torch.minimum(grid.detach().trunc().clamp_min(0), (sizes - 2).clamp_min(0))
+    return lower.int(), (grid - lower).clamp(0, 1), torch.ones_like(grid[:, 0])
 
 
-def _linear(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    lower = torch.minimum(torch.trunc(grid).long().clamp_min(0), sizes - 1)
-    upper = torch.minimum(lower + 1, sizes - 1)
-    fraction = (grid - lower).clamp(0, 1)
-    return torch.stack([lower, upper], 1), torch.stack([1 - fraction, fraction], 1)
+def _nearest_neighbor(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    rounded = torch.trunc(grid.detach() + torch.copysign(torch.full_like(grid, 0.5), grid))
+    cells = torch.minimum(rounded.clamp_min(0), sizes - 1)
+    return cells.int(), grid[:, :0], torch.ones_like(grid[:, 0])
 
 
-def _linear_border(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    lower = torch.floor(grid).long()
-    indices = torch.stack([lower, lower + 1], 1)
-    fraction = grid - lower
-    inside = (indices >= 0) & (indices < sizes)
-    weights = torch.where(inside, torch.stack([1 - fraction, fraction], 1), 0.0)
-    return torch.where(inside, indices, 0), weights
+def _linear_border(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    # Between the outermost centres as "linear"; beyond them the only cell inside the grid loses weight.
+    lower, fractions, _ = _linear(torch.minimum(grid.clamp_min(0), sizes - 1), sizes)
+    return lower, fractions, torch.minimum(1 + grid, sizes - grid).clamp(0, 1).prod(dim=1)
 
 
-INTERPOLATIONS: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
+INTERPOLATIONS: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]] = {
     "linear": _linear,
     "nearest_neighbor": _nearest_neighbor,
     "linear_border": _linear_border,
 }
 
 
-def interpolation_weights(grid: Tensor, sizes: tuple[int, ...], interpolation: str) -> tuple[Tensor, Tensor]:
-    """Cells that a grid coordinate reads, and their weights.
+def interpolate(grid: Tensor, sizes: tuple[int, ...], interpolation: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells that a grid coordinate reads.
 
     Args:
         grid: Grid coordinates g (E, D).
@@ -168,17 +163,23 @@ def interpolation_weights(grid: Tensor, sizes: tuple[int, ...], interpolation: s
             "linear_border" (cells outside the grid weigh 0).
 
     Returns:
-        Cell indices (E, P), int64, with x running fastest, and weights (E, P); P = 1 for "nearest_neighbor", else 2^D.
+        Lowest cell along each axis (E, D), int32; fraction f along each axis (E, D), so that the cell above weighs f
+        and the lowest 1 - f, or (E, 0) where only one cell is read; weight of the whole read (E,).
 
     Raises:
         ConfigError: If the interpolation is unknown.
     """
     check_choice("interpolation", interpolation, INTERPOLATIONS)
-    lengths = torch.tensor(sizes, device=grid.device)
-    indices, weights = INTERPOLATIONS[interpolation](grid, lengths)
-    strides = list(itertools.accumulate(sizes[:-1], lambda stride, size: stride * size, initial=1))
-    cells, products = indices[..., 0], weights[..., 0]
-    for axis in range(1, len(sizes)):
-        cells = (cells[:, None, :] + strides[axis] * indices[:, :, None, axis]).flatten(1)
-        products = (products[:, None, :] * weights[:, :, None, axis]).flatten(1)
-    return cells, products
+    return INTERPOLATIONS[interpolation](grid, grid.new_tensor(sizes))
+
+
+def strides(sizes: tuple[int, ...]) -> tuple[int, ...]:
+    """Steps of the linear cell index along x, y, z: z · F_y · F_x + y · F_x + x."""
+    return tuple(itertools.accumulate(sizes[:-1], lambda stride, size: stride * size, initial=1))
+
+
+def corner_offsets(sizes: tuple[int, ...]) -> list[int]:
+    """Offsets of the 2^D cells around a grid coordinate; an axis of a single cell has no cell above."""
+    steps = [stride if size > 1 else 0 for stride, size in zip(strides(sizes), sizes, strict=True)]
+    corners = range(2 ** len(sizes))
+    return [sum(step for axis, step in enumerate(steps) if corner >> axis & 1) for corner in corners]

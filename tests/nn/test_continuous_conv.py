@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from oracles.loop_cconv import loop_cconv
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
-from cconv.nn import ContinuousConv, ConvGeometry, continuous_conv
-from cconv.nn.continuous_conv import INITIALIZATIONS
+from cconv.nn import AntisymmetricConv, ContinuousConv, ConvGeometry, continuous_conv
+from cconv.nn.continuous_conv import INITIALIZATIONS, MESSAGES
 from cconv.nn.filters import INTERPOLATIONS, MAPPINGS, WINDOWS
 
 
@@ -32,9 +33,7 @@ def cloud(generator):
 )
 def test_agrees_with_the_loop_over_pairs(mapping, window, interpolation, cloud, generator):
     features, filters = normal(generator, 30, 3), normal(generator, 3, 4, 2, 3, 5)
-    for align_corners, normalize, message in itertools.product(
-        [True, False], [True, False], ["absolute", "difference"]
-    ):
+    for align_corners, normalize, message in itertools.product([True, False], [True, False], MESSAGES):
         settings = {
             "mapping": mapping, "window": window, "interpolation": interpolation,
             "align_corners": align_corners, "normalize": normalize,
@@ -48,10 +47,10 @@ def test_agrees_with_the_loop_over_pairs(mapping, window, interpolation, cloud, 
         np.testing.assert_allclose(output.numpy(), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("message", ["absolute", "difference"])
+@pytest.mark.parametrize("message", MESSAGES)
 def test_both_orders_of_multiplication_agree(message, cloud, generator):
-    """C_out < C_in multiplies first; the same filters beside zeros, so that C_out >= C_in, gather first."""
-    features, filters = normal(generator, 30, 4), normal(generator, 4, 4, 4, 4, 2)
+    """4 C_out <= C_in multiplies first; the same filters beside zeros gather first."""
+    features, filters = normal(generator, 30, 8), normal(generator, 4, 4, 4, 8, 2)
     geometry = ConvGeometry(radius_graph(cloud, 0.4), 4)
     narrow = continuous_conv(features, filters, geometry, message=message)
     wide = continuous_conv(features, torch.cat([filters, torch.zeros_like(filters)], -1), geometry, message=message)
@@ -167,13 +166,13 @@ def test_no_edges_at_all(num_particles, generator):
     assert layer.filters.grad.abs().max() == 0
 
 
-@pytest.mark.parametrize("message", ["absolute", "difference"])
-@pytest.mark.parametrize("out_channels", [1, 3])
-def test_gradients_of_first_and_second_order(message, out_channels, generator):
+@pytest.mark.parametrize("message", MESSAGES)
+@pytest.mark.parametrize(("in_channels", "out_channels"), [(2, 1), (2, 3), (4, 1), (1, 4)])
+def test_gradients_of_first_and_second_order(message, in_channels, out_channels, generator):
     geometry = ConvGeometry(radius_graph(uniform(generator, 8, 2), 0.5), 3)
     inputs = (
-        normal(generator, 8, 2).requires_grad_(),
-        normal(generator, 3, 3, 2, out_channels).requires_grad_(),
+        normal(generator, 8, in_channels).requires_grad_(),
+        normal(generator, 3, 3, in_channels, out_channels).requires_grad_(),
         normal(generator, out_channels).requires_grad_(),
     )
 
@@ -184,20 +183,48 @@ def test_gradients_of_first_and_second_order(message, out_channels, generator):
     assert torch.autograd.gradgradcheck(convolve, inputs)
 
 
+@pytest.mark.parametrize("out_channels", [1, 4])
+@pytest.mark.parametrize(("mapping", "interpolation"), list(itertools.product(MAPPINGS, INTERPOLATIONS)))
+def test_gradient_with_respect_to_positions(mapping, interpolation, out_channels, generator):
+    positions = uniform(generator, 6, 3).requires_grad_()
+    features, filters = normal(generator, 6, 4), normal(generator, 3, 4, 3, 4, out_channels)
+
+    def convolve(at):
+        edges = radius_graph(at, 0.6)
+        geometry = ConvGeometry(edges, (3, 4, 3), mapping, "poly6", interpolation, align_corners=False, normalize=True)
+        return continuous_conv(features, filters, geometry)
+
+    assert torch.autograd.gradcheck(convolve, (positions,))
+
+
+def test_a_particle_at_the_place_of_another_leaves_gradients_finite(generator):
+    for window, mapping in itertools.product(WINDOWS, MAPPINGS):
+        positions = uniform(generator, 5, 3)
+        positions[1] = positions[0]
+        positions.requires_grad_()
+        geometry = ConvGeometry(radius_graph(positions, 2.0, include_self=True), 3, mapping, window)
+        continuous_conv(normal(generator, 5, 2), normal(generator, 3, 3, 3, 2, 3), geometry).sum().backward()
+        assert torch.isfinite(positions.grad).all()
+
+
 @pytest.mark.parametrize("message", ["absolute", "difference"])
-def test_nothing_is_differentiated_with_respect_to_positions(message, cloud, generator):
-    geometry = ConvGeometry(radius_graph(cloud.requires_grad_(), 0.4), 3)
+def test_detached_positions_are_not_differentiated(message, cloud, generator):
+    geometry = ConvGeometry(radius_graph(cloud.requires_grad_(), 0.4), 3, detach_positions=True)
     features, filters = normal(generator, 30, 2), normal(generator, 3, 3, 3, 2, 4)
     assert not continuous_conv(features, filters, geometry, message=message).requires_grad
 
 
-def test_stated_memory_covers_every_matrix(cloud):
-    geometry = ConvGeometry(radius_graph(cloud, 0.4), 6)
-    matrices = [geometry.gather, geometry.gather.transposed, geometry.read, geometry.read.transposed]
-    tensors = [tensor for matrix in matrices for tensor in (matrix.offsets, matrix.columns, matrix.values)]
-    own = [geometry.cell_sums, geometry.cells, geometry.weights, geometry.receivers, geometry.senders]
-    needed = sum(tensor.nbytes for tensor in [*tensors, *own])
-    assert 0.7 * geometry.nbytes < needed <= geometry.nbytes + 64
+def test_stated_memory_is_what_is_held(cloud):
+    reads = ConvGeometry(radius_graph(cloud, 0.4), 6).reads
+    own = [reads.row_splits, reads.receivers, reads.senders, reads.cells, reads.fractions, reads.weights]
+    assert sum(tensor.nbytes for tensor in [*own, *reads.by_sender]) == reads.nbytes
+
+
+def test_a_compiled_graph_gives_the_same(cloud, generator):
+    features, filters = normal(generator, 30, 3), normal(generator, 4, 4, 4, 3, 5)
+    geometry = ConvGeometry(radius_graph(cloud, 0.4), 4)
+    compiled = torch.compile(continuous_conv, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(features, filters, geometry), continuous_conv(features, filters, geometry))
 
 
 def test_float32_agrees_with_float64(cloud, generator):
@@ -221,6 +248,63 @@ def test_same_generator_same_filters():
     assert torch.equal(first.filters, second.filters)
 
 
+def test_the_centre_cell_is_the_particle_among_its_own_neighbours(cloud, generator):
+    features = normal(generator, 30, 2)
+    layer = ContinuousConv(2, 3, 3, 3, center="cell", generator=generator).double()
+    neighbours, all_of_them = (ConvGeometry(radius_graph(cloud, 0.4, include_self=own), 3) for own in (False, True))
+    expected = continuous_conv(features, layer.filters, all_of_them, layer.bias)
+    torch.testing.assert_close(layer(features, neighbours), expected)
+
+
+def test_a_dense_centre_adds_a_matrix_product(cloud, generator):
+    features, geometry = normal(generator, 30, 2), ConvGeometry(radius_graph(cloud, 0.4), 4)
+    layer = ContinuousConv(2, 3, 4, 3, center="dense", generator=generator).double()
+    expected = continuous_conv(features, layer.filters, geometry, layer.bias) + features @ layer.center_weights
+    torch.testing.assert_close(layer(features, geometry), expected)
+
+
+def test_a_centre_needs_an_odd_kernel_and_neighbours_only(cloud, generator):
+    with pytest.raises(ConfigError, match="'dense'"):
+        ContinuousConv(2, 3, 4, 3, center="cell")
+    layer = ContinuousConv(2, 3, 3, 3, center="cell").double()
+    with pytest.raises(ConfigError, match="include_self"):
+        layer(normal(generator, 30, 2), ConvGeometry(radius_graph(cloud, 0.4, include_self=True), 3))
+
+
+@pytest.mark.parametrize("kernel_size", [4, 5])
+@pytest.mark.parametrize("mapping", MAPPINGS)
+def test_antisymmetric_filters_conserve_momentum(mapping, kernel_size, cloud, generator):
+    layer = AntisymmetricConv(3, 3, kernel_size, 3, generator=generator).double()
+    output = layer(normal(generator, 30, 3), ConvGeometry(radius_graph(cloud, 0.4), kernel_size, mapping))
+    assert output.abs().max() > 1e-3
+    assert output.sum(0).abs().max() < 1e-14 * 30
+
+
+def test_antisymmetric_filters_refuse_normalisation(cloud, generator):
+    geometry = ConvGeometry(radius_graph(cloud, 0.4), 4, normalize=True)
+    with pytest.raises(ConfigError, match="normalised"):
+        AntisymmetricConv(3, 3, 4, 3).double()(normal(generator, 30, 3), geometry)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_features_that_are_not_finite_are_named(bad, cloud, generator):
+    features = normal(generator, 30, 2)
+    features[7, 1] = bad
+    with pytest.raises(ShapeError, match=f"`features` must be finite, got {bad} at \\[7, 1\\]"):
+        ContinuousConv(2, 3, 4, 3).double()(features, ConvGeometry(radius_graph(cloud, 0.4), 4))
+
+
+def test_edges_that_do_not_fit_are_refused(cloud):
+    edges = radius_graph(cloud, 0.4)
+    for damage in (
+        {"num_senders": 20},
+        {"row_splits": edges.row_splits + 1},
+        {"displacements": edges.displacements * float("nan")},
+    ):
+        with pytest.raises(ShapeError, match="`edges`"):
+            ConvGeometry(replace(edges, **damage), 4)
+
+
 def test_bad_input_is_named(cloud, generator):
     edges = radius_graph(cloud, 0.4)
     geometry = ConvGeometry(edges, 4)
@@ -233,6 +317,13 @@ def test_bad_input_is_named(cloud, generator):
         continuous_conv(features, filters, geometry, torch.zeros(3, dtype=torch.float64))
     with pytest.raises(ShapeError, match="dtype"):
         continuous_conv(features.float(), filters, geometry)
+    with pytest.raises(ShapeError, match="`bias` must share dtype and device"):
+        continuous_conv(features, filters, geometry, torch.zeros(2))
+    with pytest.raises(ShapeError, match="`filters` must share dtype and device"):
+        continuous_conv(features, filters.to("meta"), geometry)
+    for misnamed in ({"mapping": "identiy"}, {"window": "poly7"}, {"interpolation": "cubic"}):
+        with pytest.raises(ConfigError, match=next(iter(misnamed))):
+            ConvGeometry(edges, 4, **misnamed)
     with pytest.raises(ConfigError, match="kernel_size"):
         ConvGeometry(edges, 0)
     with pytest.raises(ConfigError, match="kernel_size"):

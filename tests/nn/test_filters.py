@@ -8,9 +8,11 @@ from cconv.nn.filters import (
     INTERPOLATIONS,
     MAPPINGS,
     WINDOWS,
+    corner_offsets,
     grid_coordinates,
-    interpolation_weights,
+    interpolate,
     map_ball_to_cube,
+    strides,
     window_values,
 )
 
@@ -30,6 +32,16 @@ def unit_ball(generator, count, dim):
     directions = torch.randn(count, dim, generator=generator, dtype=torch.float64)
     directions /= directions.norm(dim=1, keepdim=True)
     return directions * torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / dim)
+
+
+def cells_and_weights(grid, sizes, interpolation):
+    """Cells (E, P) that each grid coordinate reads and their weights (E, P)."""
+    lowest, fractions, weight = interpolate(grid, sizes, interpolation)
+    cells, weights = lowest.long() @ torch.tensor(strides(sizes)), weight[:, None]
+    for axis in range(fractions.shape[1]):
+        fraction = fractions[:, axis, None]
+        weights = torch.cat([weights * (1 - fraction), weights * fraction], dim=1)
+    return cells[:, None] + torch.tensor(corner_offsets(sizes)[: weights.shape[1]]), weights
 
 
 @pytest.mark.parametrize(("ball", "volume_preserving", "radial", "grid"), VECTORS)
@@ -99,7 +111,7 @@ def test_windows_at_the_radius(window, edge):
 def test_weights_sum_to_one_inside_the_grid_of_clamping_interpolations(interpolation, sizes, generator):
     cube = torch.rand(50, len(sizes), generator=generator, dtype=torch.float64) - 0.5
     for align_corners in (True, False):
-        cells, weights = interpolation_weights(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
+        cells, weights = cells_and_weights(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
         torch.testing.assert_close(weights.sum(1), torch.ones(50, dtype=torch.float64))
         assert cells.min() >= 0
         assert cells.max() < math.prod(sizes)
@@ -109,9 +121,11 @@ def test_weights_sum_to_one_inside_the_grid_of_clamping_interpolations(interpola
 def test_a_cell_centre_reads_that_cell_alone(interpolation):
     sizes = (3, 4, 2)
     x, y, z = 2, 1, 1
-    cells, weights = interpolation_weights(torch.tensor([[x, y, z]], dtype=torch.float64), sizes, interpolation)
+    cells, weights = cells_and_weights(torch.tensor([[x, y, z]], dtype=torch.float64), sizes, interpolation)
     read = torch.zeros(24, dtype=torch.float64).index_add_(0, cells[0], weights[0])
-    assert torch.equal(read.nonzero().flatten(), torch.tensor([(z * 4 + y) * 3 + x]))
+    expected = torch.zeros(24, dtype=torch.float64)
+    expected[(z * 4 + y) * 3 + x] = 1
+    assert torch.equal(read, expected)
 
 
 def test_linear_interpolation_reproduces_a_linear_function(generator):
@@ -119,12 +133,12 @@ def test_linear_interpolation_reproduces_a_linear_function(generator):
     grid = torch.rand(40, 3, generator=generator, dtype=torch.float64) * (torch.tensor(sizes) - 1)
     z, y, x = torch.meshgrid(*(torch.arange(size, dtype=torch.float64) for size in sizes[::-1]), indexing="ij")
     table = (1 + 2 * x - 3 * y + 0.5 * z).flatten()
-    cells, weights = interpolation_weights(grid, sizes, "linear")
+    cells, weights = cells_and_weights(grid, sizes, "linear")
     torch.testing.assert_close((table[cells] * weights).sum(1), 1 + grid @ grid.new_tensor([2, -3, 0.5]))
 
 
 def test_linear_border_fades_out_beyond_the_outermost_centres():
-    _, weights = interpolation_weights(torch.tensor([[-0.25]], dtype=torch.float64), (4,), "linear_border")
+    _, weights = cells_and_weights(torch.tensor([[-0.25]], dtype=torch.float64), (4,), "linear_border")
     assert weights.sum().item() == pytest.approx(0.75)
 
 
@@ -133,7 +147,7 @@ def test_linear_border_fades_out_beyond_the_outermost_centres():
     [
         (lambda: map_ball_to_cube(torch.zeros(1, 2), "identiy"), "'identity'"),
         (lambda: window_values(torch.zeros(1), "poly"), "'poly6'"),
-        (lambda: interpolation_weights(torch.zeros(1, 1), (2,), "lineal"), "'linear'"),
+        (lambda: interpolate(torch.zeros(1, 1), (2,), "lineal"), "'linear'"),
     ],
 )
 def test_unknown_names_are_refused_with_the_nearest(call, name):

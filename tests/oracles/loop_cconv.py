@@ -77,7 +77,8 @@ def loop_cconv(
                 (u + 0.5) * (size - 1) if align_corners else (u + 0.5) * size - 0.5
                 for u, size in zip(cube, (width, height, depth), strict=True)
             ]
-            value = features[j] - features[i] if message == "difference" else features[j]
+            own = {"absolute": 0, "difference": -1, "sum": 1}[message]
+            value = features[j] + own * features[i] if own else features[j]
             for x, wx in cells_along(grid[0], width, interpolation):
                 for y, wy in cells_along(grid[1], height, interpolation):
                     for z, wz in cells_along(grid[2], depth, interpolation):

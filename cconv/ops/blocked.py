@@ -1,0 +1,246 @@
+"""Continuous convolution on the CPU, block by block: nothing of size N·K^D·C is ever kept.
+
+With the matrices S_k of the reads (row i, column j: weight with which the edge from j to i reads cell k), features F,
+filters W_k and the output Y:
+
+    gather first      Y = sum_k (S_k F) W_k         columns S_k F of a block of receivers stay in a core's cache
+    multiply first    Y = sum_k S_k (F W_k)         products F W_k are small where C_out is
+
+The derivatives are convolutions of the same kind along the edges turned round, with dY for features and the transposed
+filters. Gathering first along them gives columns T_k = S_kᵀ dY that serve both derivatives:
+
+    dF = sum_k T_k W_kᵀ,   dW_k = Fᵀ T_k
+
+Otherwise dF is read from products dY W_kᵀ, and dW_k = (S_k F)ᵀ dY from columns that are gathered again.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cconv.ops import gathers, general
+from cconv.ops.filter_reads import FilterReads
+from cconv.ops.workers import run_on_workers
+
+_BLOCK_BYTES = 3 * 2**19  # of columns that a thread works on: about a core's cache
+_PRODUCT_BYTES = 2**25  # of products between multiplying and reading
+_READS_PER_WORKER = 2**18  # fewer cost less than waking a thread
+
+Rows = tuple[np.ndarray, np.ndarray | None, np.ndarray]  # splits, order of the edges, neighbour of each edge
+
+
+def gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """As `general.gather_then_multiply`; not differentiable with respect to positions."""
+    return _BlockedConv.apply(features, filters, reads, own, _gather_then_multiply)
+
+
+def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """As `general.multiply_then_read`; not differentiable with respect to positions."""
+    return _BlockedConv.apply(features, filters, reads, own, _multiply_then_read)
+
+
+class _BlockedConv(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, features: Tensor, filters: Tensor, reads: FilterReads, own: float, compute: Callable) -> Tensor:
+        ctx.save_for_backward(features, filters)
+        ctx.reads, ctx.own = reads, own
+        return compute(features.detach().contiguous(), filters.detach(), reads, own)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        features, filters = ctx.saved_tensors
+        of_features, of_filters = ctx.needs_input_grad[:2]
+        if torch.is_grad_enabled():  # the derivative is to be differentiated again
+            inputs = [t for t, needed in ((features, of_features), (filters, of_filters)) if needed]
+            output = general.gather_then_multiply(features, filters, ctx.reads, ctx.own)
+            found = iter(torch.autograd.grad(output, inputs, gradient, create_graph=True))
+            return next(found) if of_features else None, next(found) if of_filters else None, None, None, None
+        inputs = (features.detach().contiguous(), filters.detach(), gradient.contiguous(), ctx.reads, ctx.own)
+        return *_derivatives(*inputs, of_features, of_filters), None, None, None
+
+
+def _derivatives(
+    features: Tensor,
+    filters: Tensor,
+    gradient: Tensor,
+    reads: FilterReads,
+    own: float,
+    of_features: bool,
+    of_filters: bool,
+) -> tuple[Tensor | None, Tensor | None]:
+    in_channels, out_channels = filters.shape[1:]
+    turned = general.multiplies_first(reads.num_receivers, reads.num_senders, out_channels, in_channels)
+    if turned or (not of_features and in_channels < out_channels):
+        return (
+            _features_derivative(filters, gradient, reads, own) if of_features else None,
+            _filters_derivative(features, filters, gradient, reads, own) if of_filters else None,
+        )
+    return _both_derivatives(features, filters, gradient, reads, own, of_features, of_filters)
+
+
+def _gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    num_cells, in_channels, out_channels = filters.shape
+    flat = filters.reshape(num_cells * in_channels, out_channels)
+    output = features.new_empty(reads.num_receivers, out_channels)
+    gather = _gather(features, reads, own)
+
+    def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
+        gather(first, last, columns)
+        torch.mm(columns.flatten(1), flat, out=output[first:last])
+
+    _for_blocks(reads.num_receivers, num_cells, features, visit)
+    return output
+
+
+def _multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    rows = [(1, _by_receiver(reads)), (own, _own(reads))]
+    return _read_products(features, filters, reads, rows, reads.num_receivers)
+
+
+def _features_derivative(filters: Tensor, gradient: Tensor, reads: FilterReads, own: float) -> Tensor:
+    rows = [(1, _by_sender(reads)), (own, _own(reads))]
+    return _read_products(gradient, filters.transpose(1, 2), reads, rows, reads.num_senders)
+
+
+def _filters_derivative(features: Tensor, filters: Tensor, gradient: Tensor, reads: FilterReads, own: float) -> Tensor:
+    num_cells, in_channels, out_channels = filters.shape
+    sums = _Sums(features, (num_cells * in_channels, out_channels))
+    gather = _gather(features, reads, own)
+
+    def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
+        gather(first, last, columns)
+        sums[worker].addmm_(columns.flatten(1).T, gradient[first:last])
+
+    _for_blocks(reads.num_receivers, num_cells, features, visit)
+    return sums.total().reshape(filters.shape)
+
+
+def _both_derivatives(
+    features: Tensor,
+    filters: Tensor,
+    gradient: Tensor,
+    reads: FilterReads,
+    own: float,
+    of_features: bool,
+    of_filters: bool,
+) -> tuple[Tensor | None, Tensor | None]:
+    num_cells, in_channels, out_channels = filters.shape
+    transposed = filters.transpose(1, 2).reshape(num_cells * out_channels, in_channels)
+    derivative = torch.empty_like(features)
+    sums = _Sums(features, (in_channels, num_cells * out_channels))
+    gather = _gather_turned(gradient, reads, own)
+
+    def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
+        gather(first, last, columns)
+        if of_features:
+            torch.mm(columns.flatten(1), transposed, out=derivative[first:last])
+        if of_filters:
+            sums[worker].addmm_(features[first:last].T, columns.flatten(1))
+
+    _for_blocks(reads.num_senders, num_cells, gradient, visit)
+    by_cell = sums.total().reshape(in_channels, num_cells, out_channels).transpose(0, 1)
+    return derivative if of_features else None, by_cell if of_filters else None
+
+
+def _read_products(
+    values: Tensor, filters: Tensor, reads: FilterReads, rows: list[tuple[float, Rows]], num_rows: int
+) -> Tensor:
+    """Sum of what each row's edges read of ``values @ filters``; `rows` lists edges, with a factor each."""
+    num_cells, in_channels, out_channels = filters.shape
+    flat = filters.transpose(0, 1).reshape(in_channels, num_cells * out_channels)
+    output = values.new_zeros(num_rows, out_channels)
+    arrays, edges = output.numpy(), _edges(reads)
+    chunk = max(1, _PRODUCT_BYTES // max(1, flat.shape[1] * values.element_size()))
+    for start in range(0, len(values), chunk):
+        products = (values[start : start + chunk] @ flat).reshape(-1, num_cells, out_channels).numpy()
+
+        def visit(first: int, last: int, products: np.ndarray = products, start: int = start) -> None:
+            for factor, lists in rows:
+                if factor:
+                    gathers.read(first, last, *lists, *edges, products, start, products.dtype.type(factor), arrays)
+
+        _for_ranges(num_rows, len(reads.senders) * out_channels, visit)
+    return output
+
+
+class _Sums:
+    """A sum that each worker adds to in a tensor of its own."""
+
+    def __init__(self, like: Tensor, shape: tuple[int, int]):
+        self._parts = [like.new_zeros(shape) for _ in range(torch.get_num_threads())]
+
+    def __getitem__(self, worker: int) -> Tensor:
+        return self._parts[worker]
+
+    def total(self) -> Tensor:
+        return sum(self._parts[1:], start=self._parts[0])
+
+
+def _for_blocks(num_rows: int, num_cells: int, values: Tensor, visit: Callable[[int, int, Tensor, int], None]) -> None:
+    """Call ``visit(first, last, columns, worker)`` for blocks of rows; `columns` (last - first, K^D, C) is not set.
+
+    Which worker visits which block follows from their numbers alone, so that sums come out the same every time.
+    """
+    channels = values.shape[1]
+    row_bytes = max(1, num_cells * channels * values.element_size())
+    threads = torch.get_num_threads()
+    rows = max(16, min(512, _BLOCK_BYTES // row_bytes, -(-num_rows // threads)))
+    workers = max(1, min(threads, -(-num_rows // rows)))
+
+    def work(worker: int) -> None:
+        columns = values.new_empty(rows, num_cells, channels)
+        for first in range(worker * rows, num_rows, workers * rows):
+            last = min(first + rows, num_rows)
+            visit(first, last, columns[: last - first], worker)
+
+    run_on_workers(work, workers)
+
+
+def _for_ranges(num_rows: int, num_reads: int, visit: Callable[[int, int], None]) -> None:
+    """Call ``visit(first, last)`` for one range of rows a worker."""
+    workers = max(1, min(torch.get_num_threads(), num_reads // _READS_PER_WORKER))
+    bounds = [num_rows * worker // workers for worker in range(workers + 1)]
+    run_on_workers(lambda worker: visit(bounds[worker], bounds[worker + 1]), workers)
+
+
+def _by_receiver(reads: FilterReads) -> Rows:
+    return reads.row_splits.numpy(), None, reads.senders.numpy()
+
+
+def _by_sender(reads: FilterReads) -> Rows:
+    splits, order = reads.by_sender
+    return splits.numpy(), order.numpy(), reads.receivers.numpy()
+
+
+def _own(reads: FilterReads) -> Rows:
+    return reads.row_splits.numpy(), None, reads.receivers.numpy()
+
+
+def _edges(reads: FilterReads) -> tuple[np.ndarray, ...]:
+    return tuple(t.detach().numpy() for t in (reads.cells, reads.fractions, reads.weights, reads.corner_offsets))
+
+
+def _gather(features: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:
+    """Sets the columns S_k F of a block, for messages with ``own`` times the receiver's features."""
+    values = features.numpy()
+    arrays = (*_by_receiver(reads), *_edges(reads), values)
+    if own:
+        scaled = (*arrays, values.dtype.type(own))
+        return lambda first, last, columns: gathers.gather_with_own(first, last, *scaled, columns.numpy())
+    return lambda first, last, columns: gathers.gather(first, last, *arrays, columns.numpy())
+
+
+def _gather_turned(gradient: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:
+    """Sets the columns T_k = S_kᵀ dY of a block."""
+    values, edges = gradient.numpy(), _edges(reads)
+    arrays = (*_by_sender(reads), *edges, values)
+    own_arrays = (reads.row_splits.numpy(), *edges, values, values.dtype.type(own))
+
+    def gather(first: int, last: int, columns: Tensor) -> None:
+        gathers.gather(first, last, *arrays, columns.numpy())
+        if own:
+            gathers.add_own(first, last, *own_arrays, columns.numpy())
+
+    return gather

@@ -1,0 +1,34 @@
+"""Which way a continuous convolution is computed."""
+
+import torch
+from torch import Tensor
+
+from cconv.ops import blocked, general
+from cconv.ops.filter_reads import FilterReads
+
+
+def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
+    """Sum over the edges of each receiver of window · filterᵀ · message.
+
+    Args:
+        features: (M, C_in).
+        filters: (K^D, C_in, C_out).
+        reads: Where each edge reads the filters.
+        own: Message of an edge = sender's features + ``own`` times the receiver's.
+
+    Returns:
+        (N, C_out).
+    """
+    path = blocked if _is_fast(features, reads) else general
+    if general.multiplies_first(reads.num_senders, reads.num_receivers, *filters.shape[1:]):
+        return path.multiply_then_read(features, filters, reads, own)
+    return path.gather_then_multiply(features, filters, reads, own)
+
+
+def _is_fast(features: Tensor, reads: FilterReads) -> bool:
+    return (
+        features.device.type == "cpu"
+        and features.dtype in (torch.float32, torch.float64)
+        and not reads.requires_grad
+        and not torch.compiler.is_compiling()
+    )

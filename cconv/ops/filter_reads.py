@@ -1,0 +1,75 @@
+"""Where each edge of a graph reads a grid of filters, and with which weights."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilterReads:
+    """Multilinear reads of a filter grid, one for each edge, in compressed rows by receiver.
+
+    Edge e reads the 2^A cells ``cells[e] + corner_offsets[p]``. Corner p weighs ``weights[e]`` times, for each of the A
+    axes a, ``fractions[e, a]`` where bit a of p is set and ``1 - fractions[e, a]`` where it is not. A is the number of
+    space dimensions, or 0 where an edge reads a single cell.
+
+    Attributes:
+        row_splits: Edges of receiver i stand at ``row_splits[i]:row_splits[i + 1]``, (N + 1,), int64.
+        receivers: Receiver i of each edge, (E,), int64, ascending.
+        senders: Sender j of each edge, (E,), int64.
+        cells: Lowest cell that each edge reads, (E,), int32.
+        fractions: Place between the cells, (E, A), in [0, 1].
+        weights: Window, border and 1/ψ of each edge, (E,).
+        corner_offsets: (2^A,), int32.
+        num_cells: Cells of the grid, K^D.
+        num_senders: Number of points that could send, M.
+    """
+
+    row_splits: Tensor
+    receivers: Tensor
+    senders: Tensor
+    cells: Tensor
+    fractions: Tensor
+    weights: Tensor
+    corner_offsets: Tensor
+    num_cells: int
+    num_senders: int
+
+    @property
+    def num_receivers(self) -> int:
+        """Number of receiving points N."""
+        return len(self.row_splits) - 1
+
+    @property
+    def num_corners(self) -> int:
+        """Cells that an edge reads."""
+        return len(self.corner_offsets)
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether positions are differentiated."""
+        return self.weights.requires_grad or self.fractions.requires_grad
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes, the order by sender included."""
+        tensors = (self.row_splits, self.receivers, self.senders, self.cells, self.fractions, self.weights)
+        return sum(tensor.nbytes for tensor in tensors) + 8 * (len(self.senders) + self.num_senders + 1)
+
+    @cached_property
+    def by_sender(self) -> tuple[Tensor, Tensor]:
+        """Edges in compressed rows by sender: splits (M + 1,) and the edges in that order (E,), int64."""
+        splits = self.senders.new_zeros(self.num_senders + 1)
+        torch.cumsum(torch.bincount(self.senders, minlength=self.num_senders), 0, out=splits[1:])
+        return splits, torch.argsort(self.senders, stable=True)
+
+    def corners(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Cell (E,), int64, and weight (E,) of each corner in turn."""
+        for corner, offset in enumerate(self.corner_offsets.tolist()):
+            weights = self.weights
+            for axis, fraction in enumerate(self.fractions.unbind(1)):
+                weights = weights * (fraction if corner >> axis & 1 else 1 - fraction)
+            yield self.cells.long() + offset, weights

@@ -1,0 +1,136 @@
+"""Compiled loops over edges: features into filter cells, and products out of them.
+
+All work on numpy views of the tensors of `FilterReads`, on the rows from `first` up to `last`, without Python's lock.
+Compiled code is cached on disk. Only contraction to fused multiply-adds is allowed, so that NaN and infinity stay.
+"""
+
+import numpy as np
+from numba import njit
+
+_compile = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+
+
+@njit(inline="always")
+def _corner_weight(weight, fractions, corner, first_axis):
+    for axis in range(first_axis, len(fractions)):
+        upper = weight * fractions[axis]
+        weight = upper if corner >> axis & 1 else weight - upper
+    return weight
+
+
+@njit(inline="always")
+def _spread(message, edge, cells, fractions, weights, corner_offsets, here):
+    """Add the message of an edge to the cells that it reads."""
+    # Two rows of cells at a time: few loads and stores, whatever the number of axes.
+    for corner in range(0, len(corner_offsets), 2):
+        both = _corner_weight(weights[edge], fractions[edge], corner, 1)
+        upper_weight = both * fractions[edge, 0]
+        lower_weight = both - upper_weight
+        lower = here[cells[edge] + corner_offsets[corner]]
+        upper = here[cells[edge] + corner_offsets[corner + 1]]
+        for c in range(len(message)):
+            value = message[c]
+            lower[c] += lower_weight * value
+            upper[c] += upper_weight * value
+
+
+@njit(inline="always")
+def _put(message, edge, cells, weights, here):
+    """Add the message of an edge to the one cell that it reads."""
+    cell, weight = here[cells[edge]], weights[edge]
+    for c in range(len(message)):
+        cell[c] += weight * message[c]
+
+
+@_compile
+def gather(first, last, splits, order, neighbors, cells, fractions, weights, corner_offsets, values, columns):
+    """Set columns (last - first, K^D, C) to the sums of ``values[neighbor]`` in each cell.
+
+    `splits` and `order` list the edges of each row; None for `order` stands for edges that are sorted by row.
+    """
+    columns[: last - first] = 0
+    interpolates = fractions.shape[1] > 0
+    for row in range(first, last):
+        here = columns[row - first]
+        for place in range(splits[row], splits[row + 1]):
+            edge = place if order is None else order[place]
+            there = values[neighbors[edge]]
+            if interpolates:
+                _spread(there, edge, cells, fractions, weights, corner_offsets, here)
+            else:
+                _put(there, edge, cells, weights, here)
+
+
+@_compile
+def gather_with_own(
+    first, last, splits, order, neighbors, cells, fractions, weights, corner_offsets, values, own, columns
+):
+    """As `gather`, of the messages ``values[neighbor] + own * values[row]``."""
+    message = np.empty(values.shape[1], values.dtype)
+    columns[: last - first] = 0
+    interpolates = fractions.shape[1] > 0
+    for row in range(first, last):
+        here, mine = columns[row - first], values[row]
+        for place in range(splits[row], splits[row + 1]):
+            edge = place if order is None else order[place]
+            there = values[neighbors[edge]]
+            for c in range(len(message)):
+                message[c] = there[c] + own * mine[c]
+            if interpolates:
+                _spread(message, edge, cells, fractions, weights, corner_offsets, here)
+            else:
+                _put(message, edge, cells, weights, here)
+
+
+@_compile
+def add_own(first, last, row_splits, cells, fractions, weights, corner_offsets, values, own, columns):
+    """Add ``own * values[row]`` to the cells that the edges of each row read."""
+    sums = np.empty(columns.shape[1], columns.dtype)
+    for row in range(first, last):
+        sums[:] = 0
+        for edge in range(row_splits[row], row_splits[row + 1]):
+            for corner in range(len(corner_offsets)):
+                weight = _corner_weight(weights[edge], fractions[edge], corner, 0)
+                sums[cells[edge] + corner_offsets[corner]] += weight
+        for cell in range(len(sums)):
+            weight = own * sums[cell]
+            for c in range(values.shape[1]):
+                columns[row - first, cell, c] += weight * values[row, c]
+
+
+@_compile
+def read(
+    first, last, splits, order, neighbors, cells, fractions, weights, corner_offsets, products, start, own, output
+):
+    """Add to the output of each row what its edges read from the products of their neighbours, times `own`.
+
+    `products` (P, K^D, C) are those of the neighbours from `start` on; others are left out.
+    """
+    axes, corners = fractions.shape[1], len(corner_offsets)
+    # Eight corners whatever the number of axes: along a missing one, the fraction is 0.
+    o1, o2, o3 = corner_offsets[1 % corners], corner_offsets[2 % corners], corner_offsets[3 % corners]
+    o4, o5 = corner_offsets[4 % corners], corner_offsets[5 % corners]
+    o6, o7 = corner_offsets[6 % corners], corner_offsets[7 % corners]
+    x = y = z = weights.dtype.type(0)
+    for row in range(first, last):
+        for place in range(splits[row], splits[row + 1]):
+            edge = place if order is None else order[place]
+            neighbor = neighbors[edge] - start
+            if not 0 <= neighbor < len(products):
+                continue
+            here, cell, weight = products[neighbor], cells[edge], own * weights[edge]
+            if axes > 0:
+                x = fractions[edge, 0]
+            if axes > 1:
+                y = fractions[edge, 1]
+            if axes > 2:
+                z = fractions[edge, 2]
+            for c in range(output.shape[1]):
+                v0, v2, v4, v6 = here[cell, c], here[cell + o2, c], here[cell + o4, c], here[cell + o6, c]
+                v0 += x * (here[cell + o1, c] - v0)
+                v2 += x * (here[cell + o3, c] - v2)
+                v4 += x * (here[cell + o5, c] - v4)
+                v6 += x * (here[cell + o7, c] - v6)
+                v0 += y * (v2 - v0)
+                v4 += y * (v6 - v4)
+                output[row, c] += weight * (v0 + z * (v4 - v0))

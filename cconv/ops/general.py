@@ -1,0 +1,47 @@
+"""Continuous convolution in torch operations: any device and dtype, differentiable any number of times in everything.
+
+The reference that the fast path is tested against, and the path on devices other than the CPU.
+"""
+
+from torch import Tensor
+
+from cconv.ops.filter_reads import FilterReads
+
+
+def multiplies_first(num_senders: int, num_receivers: int, in_channels: int, out_channels: int) -> bool:
+    """Whether products of the senders are so much narrower than columns of the receivers that they come first."""
+    return 4 * num_senders * out_channels <= num_receivers * in_channels
+
+
+def gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """Messages gathered into the filter cells of each receiver, then one product with the filters.
+
+    Args:
+        features: (M, C_in).
+        filters: (K^D, C_in, C_out).
+        reads: Where each edge reads the filters.
+        own: Message of an edge = sender's features + ``own`` times the receiver's.
+
+    Returns:
+        (N, C_out).
+    """
+    messages = features[reads.senders]
+    if own:
+        messages = messages + own * features[reads.receivers]
+    columns = features.new_zeros(reads.num_receivers * reads.num_cells, features.shape[1])
+    for cells, weights in reads.corners():
+        columns = columns.index_add(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
+    return columns.reshape(reads.num_receivers, -1) @ filters.flatten(0, 1)
+
+
+def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """Features of each sender multiplied with the filter of every cell, then read by the edges; arguments as above."""
+    num_cells, _, out_channels = filters.shape
+    products = (features @ filters.transpose(0, 1).flatten(1)).reshape(-1, out_channels)
+    output = features.new_zeros(reads.num_receivers, out_channels)
+    for cells, weights in reads.corners():
+        messages = products[reads.senders * num_cells + cells]
+        if own:
+            messages = messages + own * products[reads.receivers * num_cells + cells]
+        output = output.index_add(0, reads.receivers, weights[:, None] * messages)
+    return output

@@ -1,0 +1,48 @@
+"""Threads that share a loop over blocks, each with torch restricted to one thread.
+
+As many as `torch.get_num_threads()` of the calling thread, so that two processes of one thread each do not
+oversubscribe two cores.
+"""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from multiprocessing import current_process
+
+import torch
+
+
+def run_on_workers(work: Callable[[int], None], workers: int) -> None:
+    """Call ``work(worker)`` for each worker from 0, each in a thread of its own; one worker runs in this thread."""
+    if workers == 1:
+        work(0)
+        return
+    inference = torch.is_inference_mode_enabled()
+
+    def isolated(worker: int) -> None:
+        with torch.inference_mode(inference), torch.no_grad():
+            work(worker)
+
+    # A forked process has inherited the pool without its threads, hence one pool a process.
+    for done in [_pool(workers, current_process().pid).submit(isolated, worker) for worker in range(workers)]:
+        done.result()
+
+
+@lru_cache(maxsize=4)
+def _pool(workers: int, process: int) -> ThreadPoolExecutor:
+    threads = torch.get_num_threads()
+    started = threading.Barrier(workers + 1)
+
+    def start() -> None:
+        torch.get_num_threads()  # a thread's first question or operation takes over the setting of the process
+        torch.set_num_threads(1)
+        started.wait()
+
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="cconv")
+    for _ in range(workers):
+        pool.submit(start)
+    started.wait()
+    # The workers' setting holds for their own threads, but is also what threads yet to be started would take.
+    torch.set_num_threads(threads)
+    return pool

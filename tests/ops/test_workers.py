@@ -1,0 +1,37 @@
+import threading
+
+import pytest
+import torch
+
+from cconv.ops.workers import run_on_workers
+
+
+def test_each_worker_runs_once_with_one_torch_thread():
+    threads = torch.get_num_threads()
+    seen = {}
+    run_on_workers(lambda worker: seen.update({worker: torch.get_num_threads()}), 3)
+    assert seen == {0: 1, 1: 1, 2: 1}
+    assert torch.get_num_threads() == threads
+
+
+def test_one_worker_is_the_calling_thread():
+    names = []
+    run_on_workers(lambda worker: names.append(threading.current_thread().name), 1)
+    assert names == [threading.current_thread().name]
+
+
+def test_threads_started_later_keep_the_setting():
+    run_on_workers(lambda worker: None, 2)
+    found = []
+    thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert found == [torch.get_num_threads()]
+
+
+def test_an_error_reaches_the_caller():
+    def fail(worker):
+        raise ValueError(f"worker {worker}")
+
+    with pytest.raises(ValueError, match="worker 0"):
+        run_on_workers(fail, 2)
