@@ -135,7 +135,8 @@ def _linear(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _nearest_neighbor(grid: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    rounded = torch.trunc(grid.detach() + torch.copysign(torch.full_like(grid, 0.5), grid))
+    whole = grid.detach().trunc()
+    rounded = whole + (2 * (grid.detach() - whole)).trunc()  # exact, where adding a half would round 0.49999997 up
     cells = torch.minimum(rounded.clamp_min(0), sizes - 1)
     return cells.int(), grid[:, :0], torch.ones_like(grid[:, 0])
 
