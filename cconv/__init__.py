@@ -8,6 +8,7 @@ _HOMES = {
     "Box": "cconv.domain",
     "Dataset": "cconv.data.dataset",
     "Edges": "cconv.neighbors",
+    "fit_closed_form": "cconv.training.closed_form",
     "load_model": "cconv.training.checkpoint",
     "open_dataset": "cconv.data.dataset",
     "radius_graph": "cconv.neighbors",

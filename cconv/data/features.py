@@ -102,29 +102,35 @@ class Standardization:
     scale: Tensor
 
 
-def standardize_features(features: Iterable[Tensor]) -> Standardization:
+def standardize_features(features: Iterable[Tensor], center_velocity: bool = True) -> Standardization:
     """Standardisation of features [1, v, ρ] over a training split.
 
     The constant stays as it is; the components of v share one scale, so that directions are kept.
 
     Args:
         features: Tensors (N, D + 2), one a frame.
+        center_velocity: Whether the mean velocity is taken off; not for what must turn with the scene.
     """
     stacked = torch.cat([values.double() for values in features])
     one, velocity, rho = stacked[:, :1], stacked[:, 1:-1], stacked[:, -1:]
-    parts = [standardize_vectors([velocity]), standardize_vectors([rho])]
+    parts = [standardize_vectors([velocity], center_velocity), standardize_vectors([rho])]
     mean = torch.cat([torch.zeros_like(one[0]), *(part.mean for part in parts)])
     scale = torch.cat([torch.ones_like(one[0]), *(part.scale for part in parts)])
     return Standardization(mean, scale)
 
 
-def standardize_vectors(vectors: Iterable[Tensor]) -> Standardization:
+def standardize_vectors(vectors: Iterable[Tensor], center: bool = True) -> Standardization:
     """Standardisation of vectors (N, C): mean of each component, one scale for all.
 
     The scale is the root of the mean variance of the components, so that the mean squared error of standardised values
     is the mean squared error divided by the variance. A constant field keeps scale 1.
+
+    Args:
+        vectors: Tensors (N, C), one a frame.
+        center: Whether the mean is taken off; not for what must turn with the scene.
     """
     stacked = torch.cat([values.double() for values in vectors])
     variance = stacked.var(dim=0, correction=0).mean()
     scale = torch.where(variance > 0, variance.sqrt(), 1.0)
-    return Standardization(stacked.mean(dim=0), scale.expand(stacked.shape[1]).clone())
+    mean = stacked.mean(dim=0) if center else torch.zeros_like(stacked[0])
+    return Standardization(mean, scale.expand(stacked.shape[1]).clone())

@@ -21,12 +21,13 @@ def _density_gradient(state: FluidState, kernel) -> Tensor:
 
 
 TASKS = {"density_rate": _density_rate, "density_gradient": _density_gradient}
+VECTOR_TASKS = ("density_gradient",)  # targets that turn with the scene
 
 
 def target_channels(task: str, dim: int) -> int:
     """Components of a task's target: 1 for "density_rate" (D2), D for "density_gradient" (D3)."""
     check_choice("task", task, TASKS)
-    return {"density_rate": 1, "density_gradient": dim}[task]
+    return dim if task in VECTOR_TASKS else 1
 
 
 @dataclass(frozen=True, kw_only=True)

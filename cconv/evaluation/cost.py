@@ -11,9 +11,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
+from torch import Tensor, nn
 
 from cconv.data.features import Inputs
-from cconv.nn import ContinuousConv
+from cconv.nn import ContinuousConv, ConvGeometry, RadialConv, RadialGeometry
+from cconv.nn.radial_net import VectorLinear
 from cconv.ops import general
 from cconv.ops.filter_reads import FilterReads
 from cconv.training.field_model import FieldModel
@@ -93,25 +95,38 @@ def measure_costs(
 def flops_per_particle(model: FieldModel, inputs: Inputs) -> float:
     """Multiplications and additions of one particle's prediction, counted from layer sizes and mean neighbours.
 
-    A convolution gathers C_in values into 2^D cells an edge and multiplies K^D · C_in · C_out values a particle; where
-    C_out is much smaller than C_in, it multiplies first and reads C_out values an edge and cell.
+    A convolution gathers C_in values into the cells that an edge reads and multiplies K^D · C_in · C_out values a
+    particle; where C_out is much smaller than C_in, it multiplies first and reads C_out values an edge and cell.
     """
-    geometry = model.geometry(inputs)
-    particles = max(inputs.num_particles, 1)
-    network = model.network
-
-    def conv_flops(conv: ContinuousConv, reads: FilterReads) -> float:
-        in_channels, out_channels = conv.filters.shape[-2:]
-        multiplies_first = general.multiplies_first(reads.num_senders, reads.num_receivers, in_channels, out_channels)
-        read = len(reads.senders) * reads.num_corners * (out_channels if multiplies_first else in_channels)
-        multiplied = (reads.num_senders if multiplies_first else reads.num_receivers) * conv.filters.numel()
-        return 2 * (read + multiplied) / particles
-
-    total = sum(conv_flops(conv, geometry.fluid.reads) for conv in network.convs)
-    total += sum(2 * dense.weight.numel() for dense in network.dense)
+    geometry, network = model.geometry(inputs), model.network
+    total = sum(_conv_flops(conv, geometry.fluid) for conv in network.convs)
     if network.boundary_conv is not None:
-        total += conv_flops(network.boundary_conv, geometry.boundary.reads)
-    return float(total)
+        total += _conv_flops(network.boundary_conv, geometry.boundary)
+    dense = sum(_dense_flops(layer) for layer in network.dense)
+    return total / max(inputs.num_particles, 1) + dense
+
+
+def _conv_flops(conv: ContinuousConv | RadialConv, geometry: ConvGeometry | RadialGeometry) -> float:
+    if isinstance(conv, ContinuousConv):
+        return _read_flops(geometry.reads, conv.filters.flatten(0, -3))
+    vectors = conv.dim * _read_flops(geometry.reads, conv.vector_filters)
+    return _read_flops(geometry.reads, conv.scalar_filters) + vectors
+
+
+def _read_flops(reads: FilterReads, filters: Tensor) -> float:
+    in_channels, out_channels = filters.shape[1:]
+    if out_channels == 0:
+        return 0.0
+    multiplies_first = general.multiplies_first(reads.num_senders, reads.num_receivers, in_channels, out_channels)
+    read = len(reads.senders) * reads.num_corners * (out_channels if multiplies_first else in_channels)
+    multiplied = (reads.num_senders if multiplies_first else reads.num_receivers) * filters.numel()
+    return 2.0 * (read + multiplied)
+
+
+def _dense_flops(layer: nn.Linear | VectorLinear) -> float:
+    if isinstance(layer, nn.Linear):
+        return 2.0 * layer.weight.numel()
+    return 2.0 * (layer.scalar_weights.numel() + layer.dim * layer.vector_weights.numel())
 
 
 @torch.no_grad()

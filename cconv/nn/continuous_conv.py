@@ -76,7 +76,7 @@ class ConvGeometry:
         normalize: bool = False,
         detach_positions: bool = False,
     ):
-        _check_edges(edges)
+        check_edges(edges)
         self.kernel_size = grid_shape(kernel_size, edges.dim)
         self.normalize = normalize
         self.bipartite, self.includes_self = edges.bipartite, edges.includes_self
@@ -118,9 +118,6 @@ def _filter_reads(
     sizes = kernel_size[::-1]
     cube = map_ball_to_cube(-edges.displacements / edges.cutoff, mapping)  # Λ takes x_j - x_i
     lowest, fractions, factor = interpolate(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
-    importance = window_values((edges.distances / edges.cutoff) ** 2, window)
-    if normalize:
-        importance = importance / _row_sums(importance, edges)[edges.receivers]
     corners = corner_offsets(sizes)[: 2 ** fractions.shape[1]]
     return FilterReads(
         row_splits=edges.row_splits,
@@ -128,14 +125,19 @@ def _filter_reads(
         senders=edges.senders,
         cells=sum(stride * lowest[:, axis] for axis, stride in enumerate(strides(sizes))),
         fractions=fractions,
-        weights=importance * factor,
+        weights=importance(edges, window, normalize) * factor,
         corner_offsets=torch.tensor(corners, dtype=torch.int32),
         num_cells=math.prod(sizes),
         num_senders=edges.num_senders,
     )
 
 
-def _check_edges(edges: Edges) -> None:
+def check_edges(edges: Edges) -> None:
+    """Require edges that compiled loops can follow.
+
+    Raises:
+        ShapeError: If pairs, row splits and numbers of points do not fit, or a displacement is not finite.
+    """
     if not torch.isfinite(edges.displacements).all():
         raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
     fits = len(edges.senders) == len(edges.receivers) == len(edges.displacements) == int(edges.row_splits[-1])
@@ -158,9 +160,13 @@ def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:
     return shape
 
 
-def _row_sums(importance: Tensor, edges: Edges) -> Tensor:
-    sums = importance.new_zeros(edges.num_receivers).index_add_(0, edges.receivers, importance)
-    return torch.where(sums == 0, 1.0, sums)
+def importance(edges: Edges, window: str, normalize: bool) -> Tensor:
+    """Window a_R of each edge (E,), divided by ψ of its receiver if `normalize`."""
+    values = window_values((edges.distances / edges.cutoff) ** 2, window)
+    if not normalize:
+        return values
+    sums = values.new_zeros(edges.num_receivers).index_add(0, edges.receivers, values)
+    return values / torch.where(sums == 0, 1.0, sums)[edges.receivers]
 
 
 def continuous_conv(

@@ -41,6 +41,14 @@ def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, ow
     return _BlockedConv.apply(features, filters, reads, own, _multiply_then_read)
 
 
+def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """As `general.columns`, in one piece; not differentiable."""
+    gathered = features.new_empty(reads.num_receivers, reads.num_cells, features.shape[1])
+    gather = _gather(features.detach().contiguous(), reads, own)
+    _for_ranges(reads.num_receivers, gathered.numel(), lambda first, last: gather(first, last, gathered[first:last]))
+    return gathered.flatten(1)
+
+
 class _BlockedConv(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features: Tensor, filters: Tensor, reads: FilterReads, own: float, compute: Callable) -> Tensor:
@@ -154,7 +162,7 @@ def _read_products(
     arrays, edges = output.numpy(), _edges(reads)
     chunk = max(1, _PRODUCT_BYTES // max(1, flat.shape[1] * values.element_size()))
     for start in range(0, len(values), chunk):
-        products = (values[start : start + chunk] @ flat).reshape(-1, num_cells, out_channels).numpy()
+        products = (values[start : start + chunk] @ flat).unflatten(1, (num_cells, out_channels)).numpy()
 
         def visit(first: int, last: int, products: np.ndarray = products, start: int = start) -> None:
             for factor, lists in rows:

@@ -25,6 +25,16 @@ def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float =
     return path.gather_then_multiply(features, filters, reads, own)
 
 
+def columns(features: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
+    """Messages gathered into the filter cells of each receiver, (N, K^D · C_in), not differentiable.
+
+    With filters flattened to (K^D · C_in, C_out), ``columns(...) @ filters`` is the convolution. Arguments as above.
+    """
+    path = blocked if _is_fast(features, reads) else general
+    with torch.no_grad():
+        return path.columns(features, reads, own)
+
+
 def _is_fast(features: Tensor, reads: FilterReads) -> bool:
     return (
         features.device.type == "cpu"

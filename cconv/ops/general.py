@@ -25,13 +25,18 @@ def gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, 
     Returns:
         (N, C_out).
     """
+    return columns(features, reads, own) @ filters.flatten(0, 1)
+
+
+def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
+    """Messages gathered into the filter cells of each receiver, (N, K^D · C_in); arguments as above."""
     messages = features[reads.senders]
     if own:
         messages = messages + own * features[reads.receivers]
-    columns = features.new_zeros(reads.num_receivers * reads.num_cells, features.shape[1])
+    gathered = features.new_zeros(reads.num_receivers * reads.num_cells, features.shape[1])
     for cells, weights in reads.corners():
-        columns = columns.index_add(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
-    return columns.reshape(reads.num_receivers, -1) @ filters.flatten(0, 1)
+        gathered = gathered.index_add(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
+    return gathered.reshape(reads.num_receivers, -1)
 
 
 def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:

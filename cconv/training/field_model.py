@@ -5,27 +5,29 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
 from cconv.data.features import Inputs, Standardization, fluid_state, make_inputs, standardize_features
 from cconv.data.features import standardize_vectors as standardize_targets
-from cconv.data.targets import Sample, target_channels
+from cconv.data.targets import VECTOR_TASKS, Sample, target_channels
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
 from cconv.errors import ShapeError
-from cconv.neighbors import radius_graph
-from cconv.nn import ConvGeometry, ConvNet
+from cconv.neighbors import Edges, radius_graph
+from cconv.nn import ConvGeometry, ConvNet, RadialGeometry, RadialNet
 from cconv.sph.kernels import kernel_named
 
 
 class NetworkConfig(BaseModel):
-    """Hyperparameters of a ConvNet.
+    """Hyperparameters of a network: a ConvNet (`basis` "grid") or a RadialNet ("radial").
 
     The defaults have the published layer sizes and filters: 692,902 parameters for 4 inputs and 3 outputs in a scene
     with normals. Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
     `relative_cutoff` is the filter radius R in particle spacings (published: diameter 0.225 = 1.5·6·0.025 at spacing
-    0.05, so R = 2.25 spacings). The layers have `first_channels`, then `hidden_channels`, and the target's components.
+    0.05, so R = 2.25 spacings). The layers have `first_channels`, then `hidden_channels`, and the target's components;
+    a RadialNet has so many scalars and as many vectors. `kernel_size`, `mapping`, `interpolation`, `align_corners` and
+    `initialization` are the grid's, `radial_terms` is the radial basis's.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,6 +35,8 @@ class NetworkConfig(BaseModel):
     layers: int = Field(4, ge=1, le=16)
     first_channels: int = Field(32, ge=1)
     hidden_channels: int = Field(64, ge=1)
+    basis: Literal["grid", "radial"] = "grid"
+    radial_terms: int = Field(16, ge=1, le=512)
     kernel_size: int = Field(4, ge=1, le=32)
     relative_cutoff: float = Field(2.25, gt=0, le=10)
     mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (
@@ -47,11 +51,16 @@ class NetworkConfig(BaseModel):
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
 
-    def layer_channels(self, out_channels: int) -> tuple[int, ...]:
-        """Outputs of each layer."""
-        if self.layers == 1:
-            return (out_channels,)
-        return (self.first_channels, *[self.hidden_channels] * (self.layers - 2), out_channels)
+    @model_validator(mode="after")
+    def _skip_fits_basis(self) -> "NetworkConfig":
+        if self.basis == "radial" and self.skip == "after_activation":
+            raise ValueError("skip 'after_activation' is for basis 'grid'; take 'before_activation' or 'none'")
+        return self
+
+    @property
+    def hidden_widths(self) -> list[int]:
+        """Outputs of each layer but the last."""
+        return [self.first_channels, *[self.hidden_channels] * (self.layers - 2)] if self.layers > 1 else []
 
 
 class FieldConfig(BaseModel):
@@ -80,8 +89,8 @@ class FieldGeometry:
         boundary: Boundary points seen from fluid particles, or None.
     """
 
-    fluid: ConvGeometry
-    boundary: ConvGeometry | None
+    fluid: ConvGeometry | RadialGeometry
+    boundary: ConvGeometry | RadialGeometry | None
 
     @property
     def nbytes(self) -> int:
@@ -108,19 +117,7 @@ class FieldModel(nn.Module):
     ):
         super().__init__()
         self.config = config
-        network = config.network
-        self.network = ConvNet(
-            config.dim + 2,
-            network.layer_channels(target_channels(config.task, config.dim)),
-            network.kernel_size,
-            config.dim,
-            boundary_channels=config.boundary_channels,
-            activation=network.activation,
-            message=network.message,
-            skip=network.skip,
-            initialization=network.initialization,
-            generator=generator,
-        )
+        self.network = _NETWORKS[config.network.basis](config, generator)
         for name, values in (("feature", features), ("target", targets)):
             self.register_buffer(f"{name}_mean", values.mean.float())
             self.register_buffer(f"{name}_scale", values.scale.float())
@@ -156,9 +153,15 @@ class FieldModel(nn.Module):
 
     def forward(self, inputs: Inputs, geometry: FieldGeometry) -> Tensor:
         """Standardised field (N, C)."""
+        return self.network(*self.network_inputs(inputs, geometry))
+
+    def network_inputs(self, inputs: Inputs, geometry: FieldGeometry) -> tuple:
+        """What the network takes: standardised features and geometry of the fluid, then of the boundary."""
         features = (inputs.features - self.feature_mean) / self.feature_scale
+        if self.config.network.basis == "radial":
+            features = torch.cat([features[:, :1], features[:, -1:], features[:, 1:-1]], dim=1)  # scalars come first
         boundary = (inputs.boundary_features, geometry.boundary) if geometry.boundary is not None else ()
-        return self.network(features, geometry.fluid, *boundary)
+        return features, geometry.fluid, *boundary
 
     def standardize_target(self, target: Tensor) -> Tensor:
         """Field (N, C) in the units of the data to standardised values."""
@@ -173,17 +176,8 @@ class FieldModel(nn.Module):
         """Field (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
         return self.predict(make_inputs(fluid_state(frame, box, self.kernel), frame.boundary, box))
 
-    def _conv_geometry(self, edges) -> ConvGeometry:
-        network = self.config.network
-        return ConvGeometry(
-            edges,
-            network.kernel_size,
-            mapping=network.mapping,
-            window=network.window,
-            interpolation=network.interpolation,
-            align_corners=network.align_corners,
-            normalize=network.normalize,
-        )
+    def _conv_geometry(self, edges: Edges) -> ConvGeometry | RadialGeometry:
+        return _GEOMETRIES[self.config.network.basis](edges, self.config.network)
 
     def _check(self, inputs: Inputs) -> None:
         if inputs.positions.shape[1] != self.config.dim:
@@ -197,6 +191,59 @@ class FieldModel(nn.Module):
                 f"The model expects {self.config.boundary_channels} boundary features, the data have {channels}; "
                 "use a checkpoint that was trained on such a scene."
             )
+
+
+def _grid_network(config: FieldConfig, generator: torch.Generator | None) -> ConvNet:
+    network = config.network
+    return ConvNet(
+        config.dim + 2,
+        (*network.hidden_widths, target_channels(config.task, config.dim)),
+        network.kernel_size,
+        config.dim,
+        boundary_channels=config.boundary_channels,
+        activation=network.activation,
+        message=network.message,
+        skip=network.skip,
+        initialization=network.initialization,
+        generator=generator,
+    )
+
+
+def _radial_network(config: FieldConfig, generator: torch.Generator | None) -> RadialNet:
+    network = config.network
+    is_vector = config.task in VECTOR_TASKS
+    has_normals = config.boundary_channels == config.dim
+    return RadialNet(
+        (2, 1),
+        (*((width, width) for width in network.hidden_widths), (0, 1) if is_vector else (1, 0)),
+        network.radial_terms,
+        config.dim,
+        boundary_channels=(0, 1) if has_normals else (config.boundary_channels, 0),
+        activation=network.activation,
+        message=network.message,
+        residual=network.skip == "before_activation",
+        generator=generator,
+    )
+
+
+def _grid_geometry(edges: Edges, network: NetworkConfig) -> ConvGeometry:
+    return ConvGeometry(
+        edges,
+        network.kernel_size,
+        mapping=network.mapping,
+        window=network.window,
+        interpolation=network.interpolation,
+        align_corners=network.align_corners,
+        normalize=network.normalize,
+    )
+
+
+def _radial_geometry(edges: Edges, network: NetworkConfig) -> RadialGeometry:
+    return RadialGeometry(edges, network.radial_terms, window=network.window, normalize=network.normalize)
+
+
+_NETWORKS = {"grid": _grid_network, "radial": _radial_network}
+_GEOMETRIES = {"grid": _grid_geometry, "radial": _radial_geometry}
 
 
 def build_field_model(
@@ -219,6 +266,9 @@ def build_field_model(
         boundary_channels=0 if boundary is None else boundary.shape[1],
         network=network,
     )
-    features = standardize_features(sample.inputs.features for sample in train_samples)
-    targets = standardize_targets(sample.target for sample in train_samples)
+    # Shifted vectors would not turn with the scene, as all of a RadialNet does.
+    turns = network.basis == "radial"
+    features = standardize_features((sample.inputs.features for sample in train_samples), center_velocity=not turns)
+    center = not (turns and task in VECTOR_TASKS)
+    targets = standardize_targets((sample.target for sample in train_samples), center)
     return FieldModel(config, features, targets, generator)

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from systems import kernel, periodic_frame, periodic_scene, problem, samples, with_walls
 
 from cconv.data.targets import make_sample
+from cconv.data.trajectory import Boundary
 from cconv.errors import ShapeError
 from cconv.training.field_model import NetworkConfig, build_field_model
 
@@ -11,7 +14,7 @@ SMALL = NetworkConfig(layers=2, first_channels=4, kernel_size=3)
 
 def test_defaults_have_the_published_sizes_and_filters():
     network = NetworkConfig()
-    assert network.layer_channels(3) == (32, 64, 64, 3)
+    assert network.hidden_widths == [32, 64, 64]
     assert network.relative_cutoff * 0.05 == pytest.approx(0.225 / 2)
     assert (network.window, network.mapping, network.message) == ("poly6", "ball_to_cube_volume_preserving", "absolute")
 
@@ -48,3 +51,35 @@ def test_same_seed_same_weights_other_seed_others(generator):
     first, again, other = (given.build_model(SMALL, seed).network.convs[0].filters for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
+@pytest.mark.parametrize("message", ["absolute", "difference"])
+def test_a_radial_model_turns_with_the_scene(task, message, generator):
+    scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
+    train = [make_sample(frame, scene, task, kernel(scene))]
+    network = NetworkConfig(basis="radial", first_channels=6, hidden_channels=6, radial_terms=5, message=message)
+    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator)
+    quarter = torch.tensor([[0.0, -1], [1, 0]])
+    box_center = torch.tensor([0.5, 0.5])
+
+    def turn(points):
+        return (points - box_center) @ quarter.T + box_center
+
+    turned = replace(
+        frame,
+        positions=turn(frame.positions),
+        velocities=frame.velocities @ quarter.T,
+        boundary=Boundary(positions=turn(frame.boundary.positions), normals=frame.boundary.normals @ quarter.T),
+    )
+    expected = model.predict_frame(frame, scene.box)
+    if task == "density_gradient":
+        expected = expected @ quarter.T
+    torch.testing.assert_close(
+        model.predict_frame(turned, scene.box), expected, atol=1e-4 * float(expected.abs().max()), rtol=0
+    )
+
+
+def test_settings_of_the_other_basis_are_refused():
+    with pytest.raises(ValueError, match="skip 'after_activation' is for basis 'grid'"):
+        NetworkConfig(basis="radial", skip="after_activation")

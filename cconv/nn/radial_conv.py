@@ -1,0 +1,214 @@
+r"""Continuous convolution with radial filters, equivariant to rotations and reflections.
+
+Filters are sums of radial terms φ_b(r) with learned coefficients c_b, and complete up to vectors. With the direction
+:math:`\hat r = (x_j - x_i) / r`, messages s (scalars) and v (vectors) of an edge contribute
+
+.. math::
+    \text{to scalars:}\quad \phi s, \; \phi\, \hat r \cdot v
+    \qquad\text{to vectors:}\quad \phi s\, \hat r, \; \phi v, \; \phi (\hat r \cdot v)\, \hat r
+
+The terms are linear hats at evenly spaced distances from 0 to the cutoff R: filters are piecewise linear in r, as the
+grid filters are in each coordinate. D2 and D3 of SPH are of this form, with φ = -W'(r).
+
+These are all contributions that are linear in one message: see Villar et al., "Scalars are universal: Equivariant
+machine learning, structured like classical physics" (NeurIPS 2021).
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
+from cconv.neighbors import Edges
+from cconv.nn.continuous_conv import MESSAGES, check_edges, check_finite, importance
+from cconv.nn.filters import interpolate
+from cconv.ops.convolution import convolve
+from cconv.ops.filter_reads import FilterReads
+
+Channels = tuple[int, int]  # scalars, vectors
+
+
+def num_values(channels: Channels, dim: int) -> int:
+    """Numbers that hold so many scalars and vectors: scalars first, then the D components of each vector."""
+    return channels[0] + channels[1] * dim
+
+
+def split_kinds(values: Tensor, channels: Channels, dim: int) -> tuple[Tensor, Tensor]:
+    """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
+    scalars, vectors = values.split([channels[0], channels[1] * dim], dim=1)
+    return scalars, vectors.reshape(len(values), channels[1], dim)
+
+
+def join_kinds(scalars: Tensor, vectors: Tensor) -> Tensor:
+    """Values (N, S + V · D) of scalars (N, S) and vectors (N, V, D)."""
+    return torch.cat([scalars, vectors.flatten(1)], dim=1)
+
+
+class RadialGeometry:
+    """Radial terms and direction of each edge, computed once and shared by all layers with the same settings.
+
+    Args:
+        edges: Pairs of receivers i and senders j.
+        num_terms: Number of radial terms B.
+        window: Radial weight a_R: "none", "poly6", "gaussian" or "cubic_spline".
+        normalize: Whether to divide by ψ, the sum of a receiver's window values.
+        detach_positions: Whether to hold positions constant.
+
+    Attributes:
+        num_terms: As given.
+        bipartite: Whether receivers and senders are different points.
+        receivers: Receiver i of each edge, (E,).
+        senders: Sender j of each edge, (E,).
+        num_senders: Number of points that could send.
+        directions: (x_j - x_i) / r, (E, D); 0 where two points coincide.
+        reads: Terms of each edge, which counts as a sender of its own.
+
+    Raises:
+        ConfigError: If the window is unknown or there is no term.
+        ShapeError: If the edges do not fit together or hold values that are not finite.
+    """
+
+    def __init__(
+        self,
+        edges: Edges,
+        num_terms: int,
+        window: str = "none",
+        normalize: bool = False,
+        detach_positions: bool = False,
+    ):
+        check_edges(edges)
+        if not (isinstance(num_terms, int) and num_terms >= 1):
+            raise ConfigError(f"`num_terms` must be a positive whole number, got {num_terms!r}.")
+        self.num_terms = num_terms
+        self.bipartite = edges.bipartite
+        self.receivers, self.senders, self.num_senders = edges.receivers, edges.senders, edges.num_senders
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_positions):
+            apart = torch.where(edges.distances > 0, edges.distances, 1.0)
+            self.directions = -edges.displacements / apart[:, None]
+            place = (edges.distances / edges.cutoff)[:, None] * (num_terms - 1)
+            lowest, fractions, _ = interpolate(place, (num_terms,), "linear")
+            self.reads = FilterReads(
+                row_splits=edges.row_splits,
+                receivers=edges.receivers,
+                senders=torch.arange(len(edges), device=edges.senders.device),
+                cells=lowest[:, 0].contiguous(),
+                fractions=fractions,
+                weights=importance(edges, window, normalize),
+                corner_offsets=torch.tensor([0, min(1, num_terms - 1)], dtype=torch.int32),
+                num_cells=num_terms,
+                num_senders=len(edges),
+            )
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions D."""
+        return self.directions.shape[1]
+
+    @property
+    def num_receivers(self) -> int:
+        """Number of receiving points."""
+        return self.reads.num_receivers
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes, also of what convolutions add on first use."""
+        return self.reads.nbytes + self.senders.nbytes + self.directions.nbytes
+
+    def messages(self, features: Tensor, channels: Channels, message: str) -> tuple[Tensor, Tensor]:
+        """What each edge contributes before the radial terms.
+
+        Returns:
+            For scalars s and r̂ · v, (E, S + V); for vectors s r̂, v and (r̂ · v) r̂, (D, E, S + 2V).
+        """
+        values = features[self.senders]
+        if MESSAGES[message]:
+            values = values + MESSAGES[message] * features[self.receivers]
+        scalars, vectors = split_kinds(values, channels, self.dim)
+        along = torch.einsum("evd,ed->ev", vectors, self.directions)
+        directed = torch.cat([scalars, along], dim=1)[:, :, None] * self.directions[:, None, :]
+        to_scalars = torch.cat([scalars, along], dim=1)
+        # Directed scalars, vectors, directed projections.
+        to_vectors = torch.cat([directed[:, : channels[0]], vectors, directed[:, channels[0] :]], dim=1)
+        return to_scalars, to_vectors.permute(2, 0, 1)
+
+
+class RadialConv(nn.Module):
+    """A continuous convolution with radial filters; equations in the module's docstring.
+
+    Values hold scalars first, then the D components of each vector: (N, S + V · D).
+
+    Args:
+        in_channels: Scalars and vectors of a sender.
+        out_channels: Scalars and vectors of a receiver.
+        num_terms: Number of radial terms B.
+        dim: Number of space dimensions D.
+        bias: Whether to add a learned bias to the scalars, 0 at first; vectors have none.
+        message: "absolute", "difference" or "sum", as in `continuous_conv`.
+        generator: Source of the initial weights (Xavier-uniform); None for torch's global one.
+    """
+
+    def __init__(
+        self,
+        in_channels: Channels,
+        out_channels: Channels,
+        num_terms: int,
+        dim: int,
+        *,
+        bias: bool = True,
+        message: str = "absolute",
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        check_choice("message", message, MESSAGES)
+        self.in_channels, self.out_channels, self.dim, self.message = in_channels, out_channels, dim, message
+        scalars, vectors = in_channels
+        self.scalar_filters = _filters(num_terms, scalars + vectors, out_channels[0], generator)
+        self.vector_filters = _filters(num_terms, scalars + 2 * vectors, out_channels[1], generator)
+        self.bias = nn.Parameter(torch.zeros(out_channels[0])) if bias else None
+
+    def forward(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
+        """Values (M, S_in + V_in · D) of the senders to (N, S_out + V_out · D) at the receivers.
+
+        Raises:
+            ShapeError: If shapes, dtypes or devices do not fit together, or a value is not finite.
+            ConfigError: If the message is not possible.
+        """
+        self._check(features, geometry)
+        check_finite("features", features)
+        return self.convolve(features, geometry)
+
+    def convolve(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
+        """`forward` without its checks, for hidden layers."""
+        to_scalars, to_vectors = geometry.messages(features, self.in_channels, self.message)
+        scalars = convolve(to_scalars, self.scalar_filters, geometry.reads)
+        if self.bias is not None:
+            scalars = scalars + self.bias
+        if self.out_channels[1] == 0:
+            return scalars
+        vectors = [convolve(component, self.vector_filters, geometry.reads) for component in to_vectors]
+        return join_kinds(scalars, torch.stack(vectors, dim=2))
+
+    def _check(self, features: Tensor, geometry: RadialGeometry) -> None:
+        if self.message != "absolute" and geometry.bipartite:
+            raise ConfigError("`message` must be 'absolute' where receivers and senders are different points.")
+        if geometry.num_terms != len(self.scalar_filters) or geometry.dim != self.dim:
+            raise ShapeError(
+                f"`geometry` must have {len(self.scalar_filters)} terms in {self.dim} dimensions, got "
+                f"{geometry.num_terms} in {geometry.dim}."
+            )
+        check_shape("features", features.shape, (geometry.num_senders, num_values(self.in_channels, self.dim)))
+        expected = geometry.reads.weights
+        for name, tensor in (("features", features), ("filters", self.scalar_filters)):
+            if tensor.dtype != expected.dtype or tensor.device != expected.device:
+                raise ShapeError(
+                    f"`{name}` must share dtype and device with the geometry ({expected.dtype}, {expected.device}), "
+                    f"got {tensor.dtype}, {tensor.device}."
+                )
+
+
+def _filters(num_terms: int, inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Parameter:
+    filters = nn.Parameter(torch.empty(num_terms, inputs, outputs))
+    bound = math.sqrt(6 / (num_terms * max(inputs + outputs, 1)))
+    nn.init.uniform_(filters, -bound, bound, generator=generator)
+    return filters
