@@ -35,6 +35,27 @@ def test_status_and_report_of_a_finished_run(cconv, finished_run):
     assert (status, "report.html" in out) == (0, True)
 
 
+def test_fit_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
+    layer = [
+        setting
+        for value in ("layers=1", "basis=radial", "message=difference", "relative_cutoff=2.0")
+        for setting in ("--set", f"network.{value}")
+    ]
+    command = ("fit", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *layer)
+    status, out, _ = cconv(*command)
+    assert status == 0
+    assert "Validation error" in out
+    status, out, _ = cconv("evaluate", tmp_path / "one", "--split", "valid", "--json")
+    assert json.loads(out)["normalized_mse"] < 0.05
+    assert_one_clear_line(cconv(*command), "exists already")
+
+
+def test_fit_needs_a_single_layer(cconv, flow_folder, tmp_path):
+    outcome = cconv("fit", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", "--set", "network.layers=2")
+    assert_one_clear_line(outcome, "`network.layers` must be 1")
+    assert not (tmp_path / "one").exists()
+
+
 def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
     status, out, _ = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one")
     assert status == 0

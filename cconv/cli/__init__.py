@@ -6,7 +6,7 @@ import typer
 
 from cconv.cli.console import errors
 from cconv.cli.data import app as data_app
-from cconv.cli.model import evaluate, report, train
+from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.study import app as study_app
 from cconv.errors import CConvError
 
@@ -21,7 +21,7 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
-for command in (train, evaluate, report):
+for command in (train, fit, evaluate, report):
     app.command()(command)
 
 

@@ -1,4 +1,4 @@
-"""`cconv train`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
+"""`cconv train`, `cconv fit`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
 
 import shutil
 from pathlib import Path
@@ -56,6 +56,51 @@ def train(
     folder.finish("completed")
     best = min(entry["valid_normalized_mse"] for entry in entries)
     results.print(f"Best validation error {best:.4g} (normalized MSE). Checkpoint: {folder.checkpoint}", soft_wrap=True)
+
+
+def fit(
+    study: StudyFile,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Checkpoint to write; it must not exist yet.")],
+    data: DataPath = None,
+    ridge: Annotated[
+        float, typer.Option(help="Weight of the squared coefficients, in mean squares of a term of the layer.")
+    ] = 1e-10,
+    settings: Settings = None,
+) -> None:
+    """Fit a single layer to a study's data in closed form: seconds, no training.
+
+    The study's table network says which layer, e.g. experiments/closed_form.toml: layers = 1, basis = "radial" or
+    "grid", message, relative_cutoff, window. The checkpoint evaluates like a trained one (`cconv evaluate DIR`).
+    """
+    from cconv.evaluation.metrics import frame_errors, normalized_mse
+    from cconv.study.config import load_study
+    from cconv.study.problem import load_problem, open_study_data, provenance, with_data_path
+    from cconv.training.checkpoint import save_model
+    from cconv.training.closed_form import solve_closed_form
+
+    config = load_study(study, settings or [])
+    if data is not None:
+        config = with_data_path(config, data)
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; give another --out.")
+    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
+    model = problem.build_model(config.network, config.seeds.init)
+    solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
+    error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
+    card = {
+        "stage": "closed_form",
+        "network": config.network.model_dump(),
+        "ridge": ridge,
+        "data_seed": config.seeds.data,
+        "num_parameters": model.num_parameters,
+        "valid_normalized_mse": error,
+    }
+    save_model(model, out, card | provenance(config))
+    results.print(
+        f"Validation error {error:.4g} (normalized MSE), {model.num_parameters:,} parameters. Checkpoint: {out}",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 def evaluate(

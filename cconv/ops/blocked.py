@@ -22,11 +22,12 @@ from torch import Tensor
 
 from cconv.ops import gathers, general
 from cconv.ops.filter_reads import FilterReads
+from cconv.ops.products import linear
 from cconv.ops.workers import run_on_workers
 
 _BLOCK_BYTES = 3 * 2**19  # of columns that a thread works on: about a core's cache
 _PRODUCT_BYTES = 2**25  # of products between multiplying and reading
-_READS_PER_WORKER = 2**18  # fewer cost less than waking a thread
+_VALUES_PER_WORKER = 2**19  # columns or reads: fewer cost less than waking a thread
 
 Rows = tuple[np.ndarray, np.ndarray | None, np.ndarray]  # splits, order of the edges, neighbour of each edge
 
@@ -90,13 +91,13 @@ def _derivatives(
 
 def _gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
     num_cells, in_channels, out_channels = filters.shape
-    flat = filters.reshape(num_cells * in_channels, out_channels)
+    weights = filters.reshape(num_cells * in_channels, out_channels).T.contiguous()
     output = features.new_empty(reads.num_receivers, out_channels)
     gather = _gather(features, reads, own)
 
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
         gather(first, last, columns)
-        torch.mm(columns.flatten(1), flat, out=output[first:last])
+        output[first:last] = linear(columns.flatten(1), weights)
 
     _for_blocks(reads.num_receivers, num_cells, features, visit)
     return output
@@ -114,15 +115,15 @@ def _features_derivative(filters: Tensor, gradient: Tensor, reads: FilterReads, 
 
 def _filters_derivative(features: Tensor, filters: Tensor, gradient: Tensor, reads: FilterReads, own: float) -> Tensor:
     num_cells, in_channels, out_channels = filters.shape
-    sums = _Sums(features, (num_cells * in_channels, out_channels))
+    sums = _Sums(features, (out_channels, num_cells * in_channels))
     gather = _gather(features, reads, own)
 
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
         gather(first, last, columns)
-        sums[worker].addmm_(columns.flatten(1).T, gradient[first:last])
+        sums[worker].add_(linear(gradient[first:last].T, columns.flatten(1).T))
 
     _for_blocks(reads.num_receivers, num_cells, features, visit)
-    return sums.total().reshape(filters.shape)
+    return sums.total().T.reshape(filters.shape)
 
 
 def _both_derivatives(
@@ -135,7 +136,7 @@ def _both_derivatives(
     of_filters: bool,
 ) -> tuple[Tensor | None, Tensor | None]:
     num_cells, in_channels, out_channels = filters.shape
-    transposed = filters.transpose(1, 2).reshape(num_cells * out_channels, in_channels)
+    weights = filters.permute(1, 0, 2).reshape(in_channels, num_cells * out_channels)
     derivative = torch.empty_like(features)
     sums = _Sums(features, (in_channels, num_cells * out_channels))
     gather = _gather_turned(gradient, reads, own)
@@ -143,9 +144,9 @@ def _both_derivatives(
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
         gather(first, last, columns)
         if of_features:
-            torch.mm(columns.flatten(1), transposed, out=derivative[first:last])
+            derivative[first:last] = linear(columns.flatten(1), weights)
         if of_filters:
-            sums[worker].addmm_(features[first:last].T, columns.flatten(1))
+            sums[worker].add_(linear(features[first:last].T, columns.flatten(1).T))
 
     _for_blocks(reads.num_senders, num_cells, gradient, visit)
     by_cell = sums.total().reshape(in_channels, num_cells, out_channels).transpose(0, 1)
@@ -157,12 +158,12 @@ def _read_products(
 ) -> Tensor:
     """Sum of what each row's edges read of ``values @ filters``; `rows` lists edges, with a factor each."""
     num_cells, in_channels, out_channels = filters.shape
-    flat = filters.transpose(0, 1).reshape(in_channels, num_cells * out_channels)
+    weights = filters.permute(0, 2, 1).reshape(num_cells * out_channels, in_channels)
     output = values.new_zeros(num_rows, out_channels)
     arrays, edges = output.numpy(), _edges(reads)
-    chunk = max(1, _PRODUCT_BYTES // max(1, flat.shape[1] * values.element_size()))
+    chunk = max(1, _PRODUCT_BYTES // max(1, len(weights) * values.element_size()))
     for start in range(0, len(values), chunk):
-        products = (values[start : start + chunk] @ flat).unflatten(1, (num_cells, out_channels)).numpy()
+        products = linear(values[start : start + chunk], weights).unflatten(1, (num_cells, out_channels)).numpy()
 
         def visit(first: int, last: int, products: np.ndarray = products, start: int = start) -> None:
             for factor, lists in rows:
@@ -193,7 +194,7 @@ def _for_blocks(num_rows: int, num_cells: int, values: Tensor, visit: Callable[[
     """
     channels = values.shape[1]
     row_bytes = max(1, num_cells * channels * values.element_size())
-    threads = torch.get_num_threads()
+    threads = _num_workers(num_rows * num_cells * channels)
     rows = max(16, min(512, _BLOCK_BYTES // row_bytes, -(-num_rows // threads)))
     workers = max(1, min(threads, -(-num_rows // rows)))
 
@@ -206,11 +207,15 @@ def _for_blocks(num_rows: int, num_cells: int, values: Tensor, visit: Callable[[
     run_on_workers(work, workers)
 
 
-def _for_ranges(num_rows: int, num_reads: int, visit: Callable[[int, int], None]) -> None:
+def _for_ranges(num_rows: int, num_values: int, visit: Callable[[int, int], None]) -> None:
     """Call ``visit(first, last)`` for one range of rows a worker."""
-    workers = max(1, min(torch.get_num_threads(), num_reads // _READS_PER_WORKER))
+    workers = _num_workers(num_values)
     bounds = [num_rows * worker // workers for worker in range(workers + 1)]
     run_on_workers(lambda worker: visit(bounds[worker], bounds[worker + 1]), workers)
+
+
+def _num_workers(num_values: int) -> int:
+    return max(1, min(torch.get_num_threads(), num_values // _VALUES_PER_WORKER))
 
 
 def _by_receiver(reads: FilterReads) -> Rows:

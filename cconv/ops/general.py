@@ -35,7 +35,7 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
         messages = messages + own * features[reads.receivers]
     gathered = features.new_zeros(reads.num_receivers * reads.num_cells, features.shape[1])
     for cells, weights in reads.corners():
-        gathered = gathered.index_add(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
+        gathered.index_add_(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
     return gathered.reshape(reads.num_receivers, -1)
 
 
@@ -48,5 +48,5 @@ def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, ow
         messages = products[reads.senders * num_cells + cells]
         if own:
             messages = messages + own * products[reads.receivers * num_cells + cells]
-        output = output.index_add(0, reads.receivers, weights[:, None] * messages)
+        output.index_add_(0, reads.receivers, weights[:, None] * messages)
     return output

@@ -9,6 +9,7 @@ alike. Without Open3D its columns are left out. The training step needs a folder
 """
 
 import argparse
+import ctypes
 import math
 import os
 import statistics
@@ -27,7 +28,6 @@ import pandas as pd
 import seaborn as sns
 import torch
 import torch.nn.functional as F
-from rich.progress import track
 from torch import Tensor, nn
 
 from cconv import open_dataset, radius_graph
@@ -202,13 +202,15 @@ def adam(module: nn.Module) -> torch.optim.Optimizer:
 
 
 def in_turn(calls: dict[str, Callable[[], None]], seconds: float) -> dict[str, list[float]]:
-    """Milliseconds of each call, one after the other, at least five times and until `seconds` have passed."""
-    for call in calls.values():
-        call()
+    """Milliseconds of each call, one after the other, at least three times and until `seconds` have passed.
+
+    Each takes its turn twice and the second is timed, so that none pays for what the one before left in the caches.
+    """
     times: dict[str, list[float]] = {name: [] for name in calls}
     end = time.perf_counter() + seconds
-    while time.perf_counter() < end or len(next(iter(times.values()))) < 5:
+    while time.perf_counter() < end or len(next(iter(times.values()))) < 3:
         for name, call in calls.items():
+            call()
             start = time.perf_counter()
             call()
             times[name].append(1e3 * (time.perf_counter() - start))
@@ -265,11 +267,12 @@ def extra_megabytes(case: Case, variant: str) -> float:
     small = Layer(replace(case, num_particles=100, neighbors=5))  # loads and starts what stays for the whole process
     small.calls(getattr(small, variant))["forward + backward"]()
     layer = Layer(case)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew from what is held now
+    ctypes.CDLL(None).malloc_trim(0)  # freed memory goes back to the system,
+    Path("/proc/self/clear_refs").write_text("5")  # and the peak starts anew from what is held
     before = peak_bytes()
-    layer.calls(getattr(layer, variant))["forward + backward"]()
-    results = (layer.gradient, layer.features, layer.filters)
-    return (peak_bytes() - before - sum(tensor.nbytes for tensor in results)) / 1e6
+    output = getattr(layer, variant)()
+    gradients = torch.autograd.grad(output, (layer.features, layer.filters), layer.gradient)
+    return (peak_bytes() - before - sum(tensor.nbytes for tensor in (output, *gradients))) / 1e6
 
 
 def peak_bytes() -> int:
@@ -285,11 +288,13 @@ def in_fresh_process(function: Callable, *arguments) -> object:
 def measure(data: Path | None, seconds: float) -> pd.DataFrame:
     cases = [(sweep, case) for sweep, list_of_cases in SWEEPS.items() for case in list_of_cases]
     rows = []
-    for sweep, case in track(cases, description="layers"):
+    for sweep, case in cases:
+        print(f"{sweep}: {case}", flush=True)
         rows += [{"sweep": sweep, **row} for row in in_fresh_process(measure_layer, case, seconds)]
     rows += [{"sweep": "preparation", **row} for row in in_fresh_process(measure_geometry, Case(), seconds)]
     variants = {"ours": "ours", "Open3D": "open3d"} if HAS_OPEN3D else {"ours": "ours"}
-    for count in track((4000, 20000, 100000), description="memory"):
+    for count in (4000, 20000, 100000):
+        print(f"memory: {count} particles", flush=True)
         case = Case(num_particles=count)
         for name, method in variants.items():
             megabytes = in_fresh_process(extra_megabytes, case, method)

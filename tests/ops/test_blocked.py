@@ -73,7 +73,7 @@ def test_agrees_however_the_work_is_cut(generator, monkeypatch):
     for block, products, per_worker, threads in ((2**21, 2**25, 2**18, 1), (1, 1, 1, 1), (1, 1000, 1, 2)):
         monkeypatch.setattr(blocked, "_BLOCK_BYTES", block)
         monkeypatch.setattr(blocked, "_PRODUCT_BYTES", products)
-        monkeypatch.setattr(blocked, "_READS_PER_WORKER", per_worker)
+        monkeypatch.setattr(blocked, "_VALUES_PER_WORKER", per_worker)
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         for order, own, channels in itertools.product(ORDERS, OWN, [(5, 1), (3, 4), (1, 6)]):
             inputs = tensors(torch.Generator().manual_seed(1), reads, *channels)
