@@ -16,6 +16,7 @@ The geometry of a set of edges is computed once and shared by all layers with th
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -203,7 +204,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
     Raises:
         ShapeError: If a value is NaN or infinite.
     """
-    if torch.compiler.is_compiling() or torch.isfinite(tensor.detach().sum()):  # far cheaper than asking each value
+    if torch.compiler.is_compiling() or math.isfinite(_sum(tensor.detach())):  # far cheaper than asking each value
         return
     if not torch.isfinite(tensor).all():
         place = [int(index) for index in torch.nonzero(~torch.isfinite(tensor))[0]]
@@ -211,6 +212,13 @@ def check_finite(name: str, tensor: Tensor) -> None:
             f"`{name}` must be finite, got {tensor[tuple(place)].item()} at {place}; look for a division by zero or a "
             "simulation that blew up."
         )
+
+
+def _sum(tensor: Tensor) -> float:
+    if tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
+        return tensor.sum().item()
+    with np.errstate(all="ignore"):  # one pass on this thread, without waking torch's others
+        return float(tensor.numpy().sum())
 
 
 def _continuous_conv(

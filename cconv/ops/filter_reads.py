@@ -7,6 +7,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from cconv.ops import gathers
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterReads:
@@ -57,14 +59,13 @@ class FilterReads:
     def nbytes(self) -> int:
         """Memory in bytes, the order by sender included."""
         tensors = (self.row_splits, self.receivers, self.senders, self.cells, self.fractions, self.weights)
-        return sum(tensor.nbytes for tensor in tensors) + 8 * (len(self.senders) + self.num_senders + 1)
+        return sum(tensor.nbytes for tensor in tensors) + 4 * len(self.senders) + 8 * (self.num_senders + 1)
 
     @cached_property
     def by_sender(self) -> tuple[Tensor, Tensor]:
-        """Edges in compressed rows by sender: splits (M + 1,) and the edges in that order (E,), int64."""
-        splits = self.senders.new_zeros(self.num_senders + 1)
-        torch.cumsum(torch.bincount(self.senders, minlength=self.num_senders), 0, out=splits[1:])
-        return splits, torch.argsort(self.senders, stable=True)
+        """Edges in compressed rows by sender, on the CPU: splits (M + 1,), int64, and edges in that order, int32."""
+        splits, order = gathers.sort_by_sender(self.senders.numpy(), self.num_senders)
+        return torch.from_numpy(splits), torch.from_numpy(order)
 
     def corners(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Cell (E,), int64, and weight (E,) of each corner in turn."""

@@ -10,6 +10,21 @@ from numba import njit
 _compile = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
 
 
+@_compile
+def sort_by_sender(senders, num_senders):
+    """Edges in compressed rows by sender, a counting sort: splits (M + 1,), int64, and the edges in order, int32."""
+    splits = np.zeros(num_senders + 1, np.int64)
+    for sender in senders:
+        splits[sender + 1] += 1
+    splits = np.cumsum(splits)
+    places = splits[:-1].copy()
+    order = np.empty(len(senders), np.int32)
+    for edge in range(len(senders)):
+        order[places[senders[edge]]] = edge
+        places[senders[edge]] += 1
+    return splits, order
+
+
 @njit(inline="always")
 def _corner_weight(weight, fractions, corner, first_axis):
     for axis in range(first_axis, len(fractions)):

@@ -15,34 +15,39 @@ import torch
 
 
 def run_on_workers(work: Callable[[int], None], workers: int) -> None:
-    """Call ``work(worker)`` for each worker from 0, each in a thread of its own; one worker runs in this thread."""
+    """Call ``work(worker)`` for each worker from 0, each in a thread of its own; a single one runs in this thread.
+
+    Args:
+        work: What to do, given the number of the worker.
+        workers: How many, at most `torch.get_num_threads()`.
+    """
     if workers == 1:
         work(0)
         return
     inference = torch.is_inference_mode_enabled()
-    _dismiss_torch_threads()
 
     def isolated(worker: int) -> None:
         with torch.inference_mode(inference), torch.no_grad():
             work(worker)
 
     # A forked process has inherited the pool without its threads, hence one pool a process.
-    for done in [_pool(workers, current_process().pid).submit(isolated, worker) for worker in range(workers)]:
+    pool = _pool(torch.get_num_threads(), current_process().pid)
+    _dismiss_torch_threads()
+    for done in [pool.submit(isolated, worker) for worker in range(workers)]:
         done.result()
 
 
 @lru_cache(maxsize=4)
-def _pool(workers: int, process: int) -> ThreadPoolExecutor:
-    threads = torch.get_num_threads()
-    started = threading.Barrier(workers + 1)
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    started = threading.Barrier(threads + 1)
 
     def start() -> None:
         torch.get_num_threads()  # a thread's first question or operation takes over the setting of the process
         torch.set_num_threads(1)
         started.wait()
 
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="cconv")
-    for _ in range(workers):
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="cconv")
+    for _ in range(threads):
         pool.submit(start)
     started.wait()
     # The workers' setting holds for their own threads, but is also what threads yet to be started would take.
@@ -51,7 +56,7 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 
 
 def _dismiss_torch_threads() -> None:
-    """End the idle threads that torch keeps for this thread; its next parallel operation starts new ones within 0.1 ms.
+    """End the idle threads that torch keeps for this thread; its next parallel operation starts new ones.
 
     After each operation they wait busily for up to several milliseconds, on the cores that the workers need: on two
     cores a training step takes a third longer beside them.

@@ -204,12 +204,14 @@ def adam(module: nn.Module) -> torch.optim.Optimizer:
 def in_turn(calls: dict[str, Callable[[], None]], seconds: float) -> dict[str, list[float]]:
     """Milliseconds of each call, one after the other, at least three times and until `seconds` have passed.
 
-    Each takes its turn twice and the second is timed, so that none pays for what the one before left in the caches.
+    Each is called twice and the second call is timed, after a pause in which the threads of the one before fall asleep:
+    none pays for what another left in the caches or on the cores.
     """
     times: dict[str, list[float]] = {name: [] for name in calls}
     end = time.perf_counter() + seconds
     while time.perf_counter() < end or len(next(iter(times.values()))) < 3:
         for name, call in calls.items():
+            time.sleep(0.02)
             call()
             start = time.perf_counter()
             call()

@@ -67,14 +67,21 @@ def test_agrees_between_two_sets_of_points(channels, interpolation, generator):
             torch.testing.assert_close(ours, reference, atol=1e-12, rtol=1e-12)
 
 
-def test_agrees_however_the_work_is_cut(generator, monkeypatch):
+@pytest.fixture
+def restored_threads():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_agrees_however_the_work_is_cut(generator, monkeypatch, restored_threads):
     reads = reads_of(generator, 3, "linear", num_points=200)
     expected = {}
     for block, products, per_worker, threads in ((2**21, 2**25, 2**18, 1), (1, 1, 1, 1), (1, 1000, 1, 2)):
         monkeypatch.setattr(blocked, "_BLOCK_BYTES", block)
         monkeypatch.setattr(blocked, "_PRODUCT_BYTES", products)
         monkeypatch.setattr(blocked, "_VALUES_PER_WORKER", per_worker)
-        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        torch.set_num_threads(threads)
         for order, own, channels in itertools.product(ORDERS, OWN, [(5, 1), (3, 4), (1, 6)]):
             inputs = tensors(torch.Generator().manual_seed(1), reads, *channels)
             found = output_and_gradients(blocked, order, *inputs, reads, own)
@@ -137,7 +144,7 @@ for own in (0, -1):
     features, filters = torch.rand(20, 2, requires_grad=True), torch.rand(9, 2, 2, requires_grad=True)
     blocked.gather_then_multiply(features, filters, reads, own).sum().backward()
     blocked.multiply_then_read(features, filters, reads, own).sum().backward()
-loops = (gathers.gather, gathers.gather_with_own, gathers.add_own, gathers.read)
+loops = (gathers.gather, gathers.gather_with_own, gathers.add_own, gathers.read, gathers.sort_by_sender)
 print(sum(sum(loop.stats.cache_misses.values()) for loop in loops))
 print(sum(sum(loop.stats.cache_hits.values()) for loop in loops))
 """

@@ -6,11 +6,19 @@ import torch
 from cconv.ops.workers import run_on_workers
 
 
+@pytest.fixture(autouse=True)
+def two_threads():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(threads)
+
+
 def test_each_worker_runs_once_with_one_torch_thread():
     threads = torch.get_num_threads()
     seen = {}
-    run_on_workers(lambda worker: seen.update({worker: torch.get_num_threads()}), 3)
-    assert seen == {0: 1, 1: 1, 2: 1}
+    run_on_workers(lambda worker: seen.update({worker: torch.get_num_threads()}), 2)
+    assert seen == {0: 1, 1: 1}
     assert torch.get_num_threads() == threads
 
 
@@ -33,5 +41,8 @@ def test_an_error_reaches_the_caller():
     def fail(worker):
         raise ValueError(f"worker {worker}")
 
-    with pytest.raises(ValueError, match="worker 0"):
-        run_on_workers(fail, 2)
+    threads = torch.get_num_threads()
+    for workers in (1, 2):
+        with pytest.raises(ValueError, match="worker 0"):
+            run_on_workers(fail, workers)
+        assert torch.get_num_threads() == threads

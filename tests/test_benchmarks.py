@@ -1,0 +1,51 @@
+"""The benchmark script runs and writes what it says, on layers too small for its figures to mean anything."""
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+SCRIPT = Path(__file__).parents[1] / "experiments" / "benchmarks" / "continuous_conv.py"
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    spec = importlib.util.spec_from_file_location("continuous_conv_benchmark", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    threads = torch.get_num_threads()
+    yield module
+    torch.set_num_threads(threads)
+
+
+def test_measures_draws_and_compares(benchmark, monkeypatch, tmp_path):
+    cores = len(os.sched_getaffinity(0))
+
+    def tiny(**changes):
+        settings = {"num_particles": 60, "neighbors": 5, "kernel_size": 2, "in_channels": 4, "out_channels": 3}
+        return benchmark.Case(**settings | {"threads": cores} | changes)
+
+    sweeps = {name: [tiny(), tiny(out_channels=1)] for name in benchmark.SWEEPS}
+    monkeypatch.setattr(benchmark, "SWEEPS", sweeps)
+    monkeypatch.setattr(benchmark, "HAS_OPEN3D", False)
+    monkeypatch.setattr(benchmark, "measure_geometry", lambda case, seconds: [])
+    monkeypatch.setattr(benchmark, "in_fresh_process", lambda function, *arguments: function(*arguments))
+    monkeypatch.setattr(benchmark, "extra_megabytes", lambda case, variant: 1.0)
+    table = benchmark.measure(None, 0.0)
+    layers = table[table.sweep != "memory"]
+    assert set(layers.variant) == {"ours", "general path", "matrix products"}
+    assert ((layers.low <= layers.ms) & (layers.ms <= layers.high)).all()
+    assert table.loc[table.variant == "ours", "difference"].max() < 1e-5
+    benchmark.draw(table, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    assert len(benchmark.ratios(table)) == 7
+
+
+def test_edges_have_the_neighbours_that_were_asked_for(benchmark, generator):
+    positions = torch.rand(500, 3, generator=generator)
+    edges = benchmark.edges_with(positions, 20)
+    assert len(edges) / 500 == pytest.approx(20, rel=0.05)
