@@ -100,7 +100,8 @@ def radius_graph(
     else:
         receivers, senders = _pairs_between(_tree(queries, box), _tree(positions, box), cutoff)
     pairs = np.sort(receivers * len(positions) + senders)  # sorting one number a pair is faster than an order of them
-    receivers, senders = pairs // max(len(positions), 1), pairs % max(len(positions), 1)
+    receivers = pairs // max(len(positions), 1)
+    senders = pairs - receivers * len(positions)
     row_splits = np.zeros(len(receivers_at) + 1, dtype=np.int64)
     np.cumsum(np.bincount(receivers, minlength=len(receivers_at)), out=row_splits[1:])
     receivers, senders, row_splits = (

@@ -27,7 +27,7 @@ from cconv.ops.workers import run_on_workers
 
 _BLOCK_BYTES = 3 * 2**19  # of columns that a thread works on: about a core's cache
 _PRODUCT_BYTES = 2**25  # of products between multiplying and reading
-_VALUES_PER_WORKER = 2**19  # columns or reads: fewer cost less than waking a thread
+_VALUES_PER_WORKER = 2**19  # set or read: fewer cost less than waking a thread
 
 Rows = tuple[np.ndarray, np.ndarray | None, np.ndarray]  # splits, order of the edges, neighbour of each edge
 
@@ -99,7 +99,7 @@ def _gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads,
         gather(first, last, columns)
         output[first:last] = linear(columns.flatten(1), weights)
 
-    _for_blocks(reads.num_receivers, num_cells, features, visit)
+    _for_blocks(reads.num_receivers, reads, features, visit)
     return output
 
 
@@ -122,7 +122,7 @@ def _filters_derivative(features: Tensor, filters: Tensor, gradient: Tensor, rea
         gather(first, last, columns)
         sums[worker].add_(linear(gradient[first:last].T, columns.flatten(1).T))
 
-    _for_blocks(reads.num_receivers, num_cells, features, visit)
+    _for_blocks(reads.num_receivers, reads, features, visit)
     return sums.total().T.reshape(filters.shape)
 
 
@@ -148,7 +148,7 @@ def _both_derivatives(
         if of_filters:
             sums[worker].add_(linear(features[first:last].T, columns.flatten(1).T))
 
-    _for_blocks(reads.num_senders, num_cells, gradient, visit)
+    _for_blocks(reads.num_senders, reads, gradient, visit)
     by_cell = sums.total().reshape(in_channels, num_cells, out_channels).transpose(0, 1)
     return derivative if of_features else None, by_cell if of_filters else None
 
@@ -160,7 +160,7 @@ def _read_products(
     num_cells, in_channels, out_channels = filters.shape
     weights = filters.permute(0, 2, 1).reshape(num_cells * out_channels, in_channels)
     output = values.new_zeros(num_rows, out_channels)
-    arrays, edges = output.numpy(), _edges(reads)
+    sums, edges = output.numpy(), _edges(reads)
     chunk = max(1, _PRODUCT_BYTES // max(1, len(weights) * values.element_size()))
     for start in range(0, len(values), chunk):
         products = linear(values[start : start + chunk], weights).unflatten(1, (num_cells, out_channels)).numpy()
@@ -168,7 +168,7 @@ def _read_products(
         def visit(first: int, last: int, products: np.ndarray = products, start: int = start) -> None:
             for factor, lists in rows:
                 if factor:
-                    gathers.read(first, last, *lists, *edges, products, start, products.dtype.type(factor), arrays)
+                    gathers.read(first, last, *lists, *edges, products, start, products.dtype.type(factor), sums)
 
         _for_ranges(num_rows, len(reads.senders) * out_channels, visit)
     return output
@@ -187,14 +187,16 @@ class _Sums:
         return sum(self._parts[1:], start=self._parts[0])
 
 
-def _for_blocks(num_rows: int, num_cells: int, values: Tensor, visit: Callable[[int, int, Tensor, int], None]) -> None:
+def _for_blocks(
+    num_rows: int, reads: FilterReads, values: Tensor, visit: Callable[[int, int, Tensor, int], None]
+) -> None:
     """Call ``visit(first, last, columns, worker)`` for blocks of rows; `columns` (last - first, K^D, C) is not set.
 
     Which worker visits which block follows from their numbers alone, so that sums come out the same every time.
     """
-    channels = values.shape[1]
+    num_cells, channels = reads.num_cells, values.shape[1]
     row_bytes = max(1, num_cells * channels * values.element_size())
-    threads = _num_workers(num_rows * num_cells * channels)
+    threads = _num_workers((num_rows * num_cells + len(reads.senders) * reads.num_corners) * channels)
     rows = max(16, min(512, _BLOCK_BYTES // row_bytes, -(-num_rows // threads)))
     workers = max(1, min(threads, -(-num_rows // rows)))
 

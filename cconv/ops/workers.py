@@ -6,10 +6,11 @@ oversubscribe two cores.
 
 import ctypes
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from multiprocessing import current_process
+from typing import Any
 
 import torch
 
@@ -35,6 +36,19 @@ def run_on_workers(work: Callable[[int], None], workers: int) -> None:
     _dismiss_torch_threads()
     for done in [pool.submit(isolated, worker) for worker in range(workers)]:
         done.result()
+
+
+def results_of(calls: Sequence[Callable[[], Any]]) -> list:
+    """Results of `calls`, which run side by side where torch has several threads; nothing in them is differentiated."""
+    if torch.get_num_threads() == 1:
+        return [call() for call in calls]
+    results = [None] * len(calls)
+
+    def work(index: int) -> None:
+        results[index] = calls[index]()
+
+    run_on_workers(work, len(calls))
+    return results
 
 
 @lru_cache(maxsize=4)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -16,6 +17,7 @@ from cconv.domain import Box
 from cconv.errors import ShapeError
 from cconv.neighbors import Edges, radius_graph
 from cconv.nn import ConvGeometry, ConvNet, RadialGeometry, RadialNet
+from cconv.ops.workers import results_of
 from cconv.sph.kernels import kernel_named
 
 
@@ -144,12 +146,12 @@ class FieldModel(nn.Module):
             ShapeError: If the frame has another dimension or other boundary features than the model.
         """
         self._check(inputs)
-        fluid = radius_graph(inputs.positions, self.cutoff, inputs.box)
-        boundary = None
+        searches = [partial(radius_graph, inputs.positions, self.cutoff, inputs.box)]
         if self.config.boundary_channels:
-            edges = radius_graph(inputs.boundary_positions, self.cutoff, inputs.box, queries=inputs.positions)
-            boundary = self._conv_geometry(edges)
-        return FieldGeometry(self._conv_geometry(fluid), boundary)
+            walls = inputs.boundary_positions
+            searches.append(partial(radius_graph, walls, self.cutoff, inputs.box, queries=inputs.positions))
+        fluid, boundary = [*map(self._conv_geometry, results_of(searches)), None][:2]
+        return FieldGeometry(fluid, boundary)
 
     def forward(self, inputs: Inputs, geometry: FieldGeometry) -> Tensor:
         """Standardised field (N, C)."""

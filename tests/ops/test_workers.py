@@ -3,7 +3,7 @@ import threading
 import pytest
 import torch
 
-from cconv.ops.workers import run_on_workers
+from cconv.ops.workers import results_of, run_on_workers
 
 
 @pytest.fixture(autouse=True)
@@ -46,3 +46,10 @@ def test_an_error_reaches_the_caller():
         with pytest.raises(ValueError, match="worker 0"):
             run_on_workers(fail, workers)
         assert torch.get_num_threads() == threads
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_results_come_in_the_order_of_the_calls(threads):
+    torch.set_num_threads(threads)
+    assert results_of([lambda: "one", lambda: 2]) == ["one", 2]
+    assert results_of([lambda: "alone"]) == ["alone"]
