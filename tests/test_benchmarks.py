@@ -25,24 +25,29 @@ def benchmark(monkeypatch):
 def test_measures_draws_and_compares(benchmark, monkeypatch, tmp_path):
     cores = len(os.sched_getaffinity(0))
 
+    case = benchmark.Case
+
     def tiny(**changes):
         settings = {"num_particles": 60, "neighbors": 5, "kernel_size": 2, "in_channels": 4, "out_channels": 3}
-        return benchmark.Case(**settings | {"threads": cores} | changes)
+        return case(**changes | settings | {"threads": cores, "out_channels": changes.get("out_channels", 3)})
 
     sweeps = {name: [tiny(), tiny(out_channels=1)] for name in benchmark.SWEEPS}
     monkeypatch.setattr(benchmark, "SWEEPS", sweeps)
     monkeypatch.setattr(benchmark, "HAS_OPEN3D", False)
-    monkeypatch.setattr(benchmark, "measure_geometry", lambda case, seconds: [])
+    monkeypatch.setattr(benchmark, "Case", tiny)
     monkeypatch.setattr(benchmark, "in_fresh_process", lambda function, *arguments: function(*arguments))
     monkeypatch.setattr(benchmark, "extra_megabytes", lambda case, variant: 1.0)
-    table = benchmark.measure(None, 0.0)
+    table = benchmark.measure_sweeps(0.0)
     layers = table[table.sweep != "memory"]
     assert set(layers.variant) == {"ours", "general path", "matrix products"}
     assert ((layers.low <= layers.ms) & (layers.ms <= layers.high)).all()
     assert table.loc[table.variant == "ours", "difference"].max() < 1e-5
     benchmark.draw(table, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000
-    assert len(benchmark.ratios(table)) == 7
+    ratios = benchmark.ratios(benchmark.measure_targets(None, 0.0)).set_index("what").measured
+    assert ratios["the same: ours / matrix products"] > 0
+    assert ratios["geometry of 100,000 edges / layer"] > 0
+    assert ratios["extra memory at N = 100,000, MB"] == 1
 
 
 def test_edges_have_the_neighbours_that_were_asked_for(benchmark, generator):
