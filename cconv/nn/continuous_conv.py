@@ -15,6 +15,7 @@ The geometry of a set of edges is computed once and shared by all layers with th
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -155,7 +156,7 @@ def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:
     Raises:
         ConfigError: If a size is not a positive whole number or the number of axes differs.
     """
-    shape = (kernel_size,) * dim if isinstance(kernel_size, int) else tuple(kernel_size)
+    shape = tuple(kernel_size) if isinstance(kernel_size, Sequence) else (kernel_size,) * dim
     if len(shape) != dim or not all(isinstance(size, int) and size >= 1 for size in shape):
         raise ConfigError(f"`kernel_size` must be a positive whole number or {dim} of them, got {kernel_size!r}.")
     return shape

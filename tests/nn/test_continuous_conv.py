@@ -324,10 +324,9 @@ def test_bad_input_is_named(cloud, generator):
     for misnamed in ({"mapping": "identiy"}, {"window": "poly7"}, {"interpolation": "cubic"}):
         with pytest.raises(ConfigError, match=next(iter(misnamed))):
             ConvGeometry(edges, 4, **misnamed)
-    with pytest.raises(ConfigError, match="kernel_size"):
-        ConvGeometry(edges, 0)
-    with pytest.raises(ConfigError, match="kernel_size"):
-        ConvGeometry(edges, (4, 4))
+    for kernel_size in (0, 2.5, (4, 4), (4, 4, 0)):
+        with pytest.raises(ConfigError, match="kernel_size"):
+            ConvGeometry(edges, kernel_size)
     with pytest.raises(ConfigError, match="difference"):
         continuous_conv(features, filters, geometry, message="differences")
     bipartite = ConvGeometry(radius_graph(cloud, 0.4, queries=cloud), 4)
