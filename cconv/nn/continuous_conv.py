@@ -237,8 +237,16 @@ def _check_inputs(features: Tensor, filters: Tensor, geometry: ConvGeometry, bia
     check_shape("features", features.shape, (geometry.num_senders, filters.shape[-2]))
     if bias is not None:
         check_shape("bias", bias.shape, (filters.shape[-1],))
-    expected = geometry.reads.weights
-    for name, tensor in (("features", features), ("filters", filters), ("bias", bias)):
+    check_kind(geometry.reads.weights, features=features, filters=filters, bias=bias)
+
+
+def check_kind(expected: Tensor, **tensors: Tensor | None) -> None:
+    """Require dtype and device of the geometry's tensor `expected`.
+
+    Raises:
+        ShapeError: If one of `tensors` differs.
+    """
+    for name, tensor in tensors.items():
         if tensor is not None and (tensor.dtype != expected.dtype or tensor.device != expected.device):
             raise ShapeError(
                 f"`{name}` must share dtype and device with the geometry ({expected.dtype}, {expected.device}), "

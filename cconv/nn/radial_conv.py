@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
 from cconv.neighbors import Edges
-from cconv.nn.continuous_conv import MESSAGES, check_edges, check_finite, importance
+from cconv.nn.continuous_conv import MESSAGES, check_edges, check_finite, check_kind, importance
 from cconv.nn.filters import interpolate
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
@@ -198,13 +198,7 @@ class RadialConv(nn.Module):
                 f"{geometry.num_terms} in {geometry.dim}."
             )
         check_shape("features", features.shape, (geometry.num_senders, num_values(self.in_channels, self.dim)))
-        expected = geometry.reads.weights
-        for name, tensor in (("features", features), ("filters", self.scalar_filters)):
-            if tensor.dtype != expected.dtype or tensor.device != expected.device:
-                raise ShapeError(
-                    f"`{name}` must share dtype and device with the geometry ({expected.dtype}, {expected.device}), "
-                    f"got {tensor.dtype}, {tensor.device}."
-                )
+        check_kind(geometry.reads.weights, features=features, filters=self.scalar_filters)
 
 
 def _filters(num_terms: int, inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Parameter:
