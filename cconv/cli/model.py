@@ -23,17 +23,11 @@ def train(
     Its tables network and training are used; without a table network that is the published baseline. The checkpoint of
     the smallest validation error stands in DIR/checkpoint, also after Ctrl-C.
     """
-    from cconv.study.config import load_study
-    from cconv.study.problem import load_problem, open_study_data, provenance, with_data_path
+    from cconv.study.problem import provenance
     from cconv.study.records import TrialFolder
     from cconv.study.trial import run_trial
 
-    config = load_study(study, settings or [])
-    if data is not None:
-        config = with_data_path(config, data)
-    if out.exists():
-        raise ConfigError(f"{out}: exists already; give another --out.")
-    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
+    config, problem = _study_and_problem(study, data, settings, out)
     folder = TrialFolder(out)
     try:
         with TrainingBar(errors, config.name, config.training.updates) as bar:
@@ -73,17 +67,11 @@ def fit(
     "grid", message, relative_cutoff, window. The checkpoint evaluates like a trained one (`cconv evaluate DIR`).
     """
     from cconv.evaluation.metrics import frame_errors, normalized_mse
-    from cconv.study.config import load_study
-    from cconv.study.problem import load_problem, open_study_data, provenance, with_data_path
+    from cconv.study.problem import provenance
     from cconv.training.checkpoint import save_model
     from cconv.training.closed_form import solve_closed_form
 
-    config = load_study(study, settings or [])
-    if data is not None:
-        config = with_data_path(config, data)
-    if out.exists():
-        raise ConfigError(f"{out}: exists already; give another --out.")
-    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
+    config, problem = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.network, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
     error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
@@ -155,3 +143,17 @@ def report(path: RunPath) -> None:
     from cconv.study.records import RunFolder
 
     results.print(f"Report: {write_report(RunFolder.open(path))}", soft_wrap=True)
+
+
+def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
+    """Settings and samples of a study whose single model goes to `out`, which must not exist yet."""
+    from cconv.study.config import load_study
+    from cconv.study.problem import load_problem, open_study_data, with_data_path
+
+    config = load_study(study, settings or [])
+    if data is not None:
+        config = with_data_path(config, data)
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; give another --out.")
+    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
+    return config, problem

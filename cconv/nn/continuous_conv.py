@@ -142,12 +142,21 @@ def check_edges(edges: Edges) -> None:
     """
     if not torch.isfinite(edges.displacements).all():
         raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
-    fits = len(edges.senders) == len(edges.receivers) == len(edges.displacements) == int(edges.row_splits[-1])
-    if not fits or (len(edges) and not 0 <= int(edges.senders.min()) <= int(edges.senders.max()) < edges.num_senders):
+    lengths = {len(edges.senders), len(edges.receivers), len(edges.displacements), int(edges.row_splits[-1])}
+    fits = len(lengths) == 1 and int(edges.row_splits[0]) == 0 and not (edges.row_splits.diff() < 0).any()
+    if (
+        not fits
+        or not _all_below(edges.senders, edges.num_senders)
+        or not _all_below(edges.receivers, edges.num_receivers)
+    ):
         raise ShapeError(
             f"`edges` must list pairs among {edges.num_receivers} receivers and {edges.num_senders} senders, got row "
-            "splits or senders beyond that; build them with `radius_graph`."
+            "splits or indices beyond that; build them with `radius_graph`."
         )
+
+
+def _all_below(indices: Tensor, count: int) -> bool:
+    return len(indices) == 0 or 0 <= int(indices.min()) <= int(indices.max()) < count
 
 
 def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:
@@ -254,6 +263,21 @@ def check_kind(expected: Tensor, **tensors: Tensor | None) -> None:
             )
 
 
+def uniform_filters(
+    shape: tuple[int, ...],
+    in_channels: int,
+    out_channels: int,
+    generator: torch.Generator | None,
+    bound: float | None = None,
+) -> nn.Parameter:
+    """Filters (*shape, C_in, C_out), uniform in ±bound; None for Xavier's, whose fans count the whole shape."""
+    filters = nn.Parameter(torch.empty(*shape, in_channels, out_channels))
+    fans = math.prod(shape) * max(in_channels + out_channels, 1)
+    bound = math.sqrt(6 / fans) if bound is None else bound
+    nn.init.uniform_(filters, -bound, bound, generator=generator)
+    return filters
+
+
 class ContinuousConv(nn.Module):
     """A continuous convolution with learned filters; equation in the module's docstring.
 
@@ -296,11 +320,9 @@ class ContinuousConv(nn.Module):
         if center == "cell" and not all(size % 2 for size in shape):
             raise ConfigError(f"`center` 'cell' needs odd kernel sizes, got {shape}; take 'dense' with even ones.")
         self.message, self.center = message, center
-        self.filters = nn.Parameter(torch.empty(*shape, in_channels, out_channels))
+        bound = 0.05 if initialization == "open3d" else None
+        self.filters = uniform_filters(shape, in_channels, out_channels, generator, bound)
         self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
-        fans = math.prod(shape) * (in_channels + out_channels)
-        bound = 0.05 if initialization == "open3d" else math.sqrt(6 / fans)
-        nn.init.uniform_(self.filters, -bound, bound, generator=generator)
         self.center_weights = None
         if center == "dense":
             self.center_weights = nn.Parameter(torch.empty(in_channels, out_channels))
@@ -314,14 +336,14 @@ class ContinuousConv(nn.Module):
 
     def convolve(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
         """`forward` without its checks, for hidden layers: what diverged weights make of good inputs passes on."""
-        output = _continuous_conv(features, self.filters, geometry, self.bias, self.message)
-        if self.center == "none":
-            return output
-        if geometry.bipartite or geometry.includes_self:
+        if self.center != "none" and (geometry.bipartite or geometry.includes_self):
             raise ConfigError(
                 f"`center` {self.center!r} needs receivers and senders to be the same points and edges without the "
                 "particle itself (`include_self=False`)."
             )
+        output = _continuous_conv(features, self.filters, geometry, self.bias, self.message)
+        if self.center == "none":
+            return output
         return output + features @ (self._center_cell if self.center_weights is None else self.center_weights)
 
     @property
@@ -361,10 +383,7 @@ class AntisymmetricConv(nn.Module):
         generator: torch.Generator | None = None,
     ):
         super().__init__()
-        shape = grid_shape(kernel_size, dim)
-        self.filters = nn.Parameter(torch.empty(*shape, in_channels, out_channels))
-        bound = math.sqrt(6 / (math.prod(shape) * (in_channels + out_channels)))
-        nn.init.uniform_(self.filters, -bound, bound, generator=generator)
+        self.filters = uniform_filters(grid_shape(kernel_size, dim), in_channels, out_channels, generator)
 
     def forward(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
         """Features (N, C_in) to (N, C_out), summing to zero over the particles.

@@ -14,14 +14,19 @@ These are all contributions that are linear in one message: see Villar et al., "
 machine learning, structured like classical physics" (NeurIPS 2021).
 """
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
 from cconv.neighbors import Edges
-from cconv.nn.continuous_conv import MESSAGES, check_edges, check_finite, check_kind, importance
+from cconv.nn.continuous_conv import (
+    MESSAGES,
+    check_edges,
+    check_finite,
+    check_kind,
+    importance,
+    uniform_filters,
+)
 from cconv.nn.filters import interpolate
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
@@ -163,8 +168,8 @@ class RadialConv(nn.Module):
         check_choice("message", message, MESSAGES)
         self.in_channels, self.out_channels, self.dim, self.message = in_channels, out_channels, dim, message
         scalars, vectors = in_channels
-        self.scalar_filters = _filters(num_terms, scalars + vectors, out_channels[0], generator)
-        self.vector_filters = _filters(num_terms, scalars + 2 * vectors, out_channels[1], generator)
+        self.scalar_filters = uniform_filters((num_terms,), scalars + vectors, out_channels[0], generator)
+        self.vector_filters = uniform_filters((num_terms,), scalars + 2 * vectors, out_channels[1], generator)
         self.bias = nn.Parameter(torch.zeros(out_channels[0])) if bias else None
 
     def forward(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
@@ -199,10 +204,3 @@ class RadialConv(nn.Module):
             )
         check_shape("features", features.shape, (geometry.num_senders, num_values(self.in_channels, self.dim)))
         check_kind(geometry.reads.weights, features=features, filters=self.scalar_filters)
-
-
-def _filters(num_terms: int, inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Parameter:
-    filters = nn.Parameter(torch.empty(num_terms, inputs, outputs))
-    bound = math.sqrt(6 / (num_terms * max(inputs + outputs, 1)))
-    nn.init.uniform_(filters, -bound, bound, generator=generator)
-    return filters

@@ -66,27 +66,18 @@ class _BlockedConv(torch.autograd.Function):
             output = general.gather_then_multiply(features, filters, ctx.reads, ctx.own)
             found = iter(torch.autograd.grad(output, inputs, gradient, create_graph=True))
             return next(found) if of_features else None, next(found) if of_filters else None, None, None, None
-        inputs = (features.detach().contiguous(), filters.detach(), gradient.contiguous(), ctx.reads, ctx.own)
-        return *_derivatives(*inputs, of_features, of_filters), None, None, None
-
-
-def _derivatives(
-    features: Tensor,
-    filters: Tensor,
-    gradient: Tensor,
-    reads: FilterReads,
-    own: float,
-    of_features: bool,
-    of_filters: bool,
-) -> tuple[Tensor | None, Tensor | None]:
-    in_channels, out_channels = filters.shape[1:]
-    turned = general.multiplies_first(reads.num_receivers, reads.num_senders, out_channels, in_channels)
-    if turned or (not of_features and in_channels < out_channels):
-        return (
-            _features_derivative(filters, gradient, reads, own) if of_features else None,
-            _filters_derivative(features, filters, gradient, reads, own) if of_filters else None,
-        )
-    return _both_derivatives(features, filters, gradient, reads, own, of_features, of_filters)
+        features, filters, gradient = features.detach().contiguous(), filters.detach(), gradient.contiguous()
+        reads, own = ctx.reads, ctx.own
+        in_channels, out_channels = filters.shape[1:]
+        reads_products = general.multiplies_first(reads.num_receivers, reads.num_senders, out_channels, in_channels)
+        if reads_products or (not of_features and in_channels < out_channels):
+            derivatives = (
+                _features_derivative(filters, gradient, reads, own) if of_features else None,
+                _filters_derivative(features, filters, gradient, reads, own) if of_filters else None,
+            )
+        else:
+            derivatives = _both_derivatives(features, filters, gradient, reads, own, of_features, of_filters)
+        return *derivatives, None, None, None
 
 
 def _gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:

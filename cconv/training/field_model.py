@@ -150,8 +150,8 @@ class FieldModel(nn.Module):
         if self.config.boundary_channels:
             walls = inputs.boundary_positions
             searches.append(partial(radius_graph, walls, self.cutoff, inputs.box, queries=inputs.positions))
-        fluid, boundary = [*map(self._conv_geometry, results_of(searches)), None][:2]
-        return FieldGeometry(fluid, boundary)
+        fluid, *boundary = map(self._conv_geometry, results_of(searches))
+        return FieldGeometry(fluid, boundary[0] if boundary else None)
 
     def forward(self, inputs: Inputs, geometry: FieldGeometry) -> Tensor:
         """Standardised field (N, C)."""

@@ -299,6 +299,8 @@ def test_edges_that_do_not_fit_are_refused(cloud):
     for damage in (
         {"num_senders": 20},
         {"row_splits": edges.row_splits + 1},
+        {"row_splits": edges.row_splits.clone().index_fill_(0, torch.tensor([1]), 10**6)},
+        {"receivers": edges.receivers + 30},
         {"displacements": edges.displacements * float("nan")},
     ):
         with pytest.raises(ShapeError, match="`edges`"):
