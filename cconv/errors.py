@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 class CConvError(ValueError):
-    """Base of every error that `cconv` raises for input it cannot use."""
+    """Base of every error that `cconv` raises on purpose."""
 
 
 class ShapeError(CConvError):
@@ -18,6 +18,10 @@ class ConfigError(CConvError):
 
 class DataError(CConvError):
     """A file or folder of particle data is missing, damaged or inconsistent."""
+
+
+class SimulationError(CConvError):
+    """A simulation did not stay finite."""
 
 
 def check_shape(name: str, shape: Iterable[int], expected: tuple[int | str, ...]) -> None:

@@ -122,6 +122,16 @@ def radius_graph(
     )
 
 
+def half_list(positions: Tensor, cutoff: float, box: Box | None = None) -> np.ndarray:
+    """Pairs within `cutoff` without distances, each listed once: (P, 2), in no particular order.
+
+    Arguments and errors are those of `radius_graph`.
+    """
+    _check_points(positions, positions, box)
+    _check_cutoff(cutoff, box)
+    return _tree(positions, box).query_pairs(cutoff, output_type="ndarray").reshape(-1, 2)
+
+
 def _check_points(positions: Tensor, queries: Tensor, box: Box | None) -> None:
     for name, points in (("positions", positions), ("queries", queries)):
         if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
