@@ -96,9 +96,9 @@ class ParticleState:
 
 
 def largest_time_step(
-    particle_spacing: float, sound_speed: float, reference_speed: float, viscosity: float, force: float
+    *, particle_spacing: float, sound_speed: float, reference_speed: float, viscosity: float = 0.0, force: float = 0.0
 ) -> float:
-    """Time step below which sound, viscosity and force are resolved (Adami et al. 2012, eqs. 19 to 21).
+    """Time step up to which sound, viscosity and force are resolved (Adami et al. 2012, eqs. 19 to 21).
 
     Args:
         particle_spacing: dx.
@@ -107,12 +107,36 @@ def largest_time_step(
         viscosity: Largest kinematic viscosity ν.
         force: Largest external acceleration.
     """
-    limits = [particle_spacing / (sound_speed + reference_speed)]
+    return CFL * min(_time_scales(particle_spacing, sound_speed + reference_speed, viscosity, force).values())
+
+
+def check_time_step(
+    time_step: float,
+    *,
+    particle_spacing: float,
+    sound_speed: float,
+    reference_speed: float,
+    viscosity: float = 0.0,
+    force: float = 0.0,
+) -> None:
+    """Raise `ConfigError`, naming the condition, unless a time step is positive and at most `largest_time_step`."""
+    scales = _time_scales(particle_spacing, sound_speed + reference_speed, viscosity, force)
+    condition = min(scales, key=scales.get)
+    limit = CFL * scales[condition]
+    if not 0 < time_step <= limit * (1 + 1e-9):
+        raise ConfigError(
+            f"`time_step` must be positive and at most {limit:.4g}, the limit set by {condition}, got {time_step:g}; take "
+            "a smaller one, or none to have it chosen."
+        )
+
+
+def _time_scales(particle_spacing: float, signal_speed: float, viscosity: float, force: float) -> dict[str, float]:
+    scales = {"the speed of sound": particle_spacing / signal_speed}
     if viscosity > 0:
-        limits.append(particle_spacing**2 / viscosity)
+        scales["viscosity"] = particle_spacing**2 / viscosity
     if force > 0:
-        limits.append(math.sqrt(particle_spacing / force))
-    return CFL * min(limits)
+        scales["the external force"] = math.sqrt(particle_spacing / force)
+    return scales
 
 
 class WeaklyCompressibleSPH:

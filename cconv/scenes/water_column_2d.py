@@ -1,0 +1,67 @@
+"""Water at rest under gravity in an open box, 2D: what a solver or network must leave as it is.
+
+Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), section 4.1, has the same test.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cconv.domain import Box
+from cconv.scenes.simulated_scene import SimulatedScene
+from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaterColumn2D(SimulatedScene):
+    """Depth and width 1, gravity 1. Trajectories differ in how the particles start; the first motion dies out."""
+
+    particle_spacing: float = 0.02
+    viscosity: float = 0.01
+    num_frames: int = 101
+    num_trajectories: int = 8
+
+    name = "water_column_2d"
+    case = "CW"
+    dim = 2
+    source = "Adami, Hu, Adams (2012), section 4.1"
+    reference_speed = math.sqrt(2)
+    density_scheme = "evolution"
+    artificial_viscosity = 0.1
+    gravity = (0.0, -1.0)
+    free_surface = True
+    sizes = {
+        "published": {},
+        "small": {"particle_spacing": 0.05, "num_frames": 41, "steps_per_frame": 25, "relaxation_steps": 300},
+    }
+
+    @property
+    def _corner(self) -> tuple[float, float]:
+        margin = WALL_LAYERS * self.particle_spacing
+        return (margin, margin)
+
+    @property
+    def _counts(self) -> tuple[int, int]:
+        cells = round(1 / self.particle_spacing)
+        return cells, cells
+
+    @property
+    def box(self) -> Box:
+        """The water, its walls, and as much room above."""
+        margin = WALL_LAYERS * self.particle_spacing
+        return Box((0.0, 0.0), (1 + 2 * margin, 1.5 + 2 * margin))
+
+    @property
+    def walls(self) -> Walls:
+        """Bottom, sides and lid of the box."""
+        across, up = self._counts
+        return walls_around((across, up + up // 2), self.particle_spacing, self._corner)
+
+    def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """A lattice relaxed in a closed box of the water's size, at rest."""
+        start = lattice(self._counts, self.particle_spacing, self._corner)
+        closed = walls_around(self._counts, self.particle_spacing, self._corner)
+        positions = self.relaxed(start, self.box, closed, generator)
+        return positions, torch.zeros_like(positions)
