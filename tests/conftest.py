@@ -36,10 +36,12 @@ def cconv(monkeypatch, capfd):
 @pytest.fixture(scope="session")
 def flow_folder(tmp_path_factory):
     """A small Taylor–Green data set."""
-    from cconv.data.generate import generate_taylor_green_2d
+    from cconv.data.generate import generate
+    from cconv.scenes import scene_named
 
     folder = tmp_path_factory.mktemp("data") / "flow"
-    generate_taylor_green_2d(folder, num_trajectories=4, num_frames=4, particles_per_side=10, seed=0)
+    scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=5, relaxation_steps=50)
+    generate(scene, folder, num_trajectories=4, num_frames=4, workers=1)
     return folder
 
 

@@ -6,13 +6,13 @@ from particle_files import record_frames, write_hdf5, write_parts
 
 from cconv.data.dataset import open_dataset
 
-SMALL = ["--trajectories", "3", "--frames", "4", "--particles-per-side", "8"]
+SMALL = ["--size", "small", "--trajectories", "3", "--frames", "4", "--particle-spacing", "0.125", "--workers", "1"]
 
 
 def test_generated_set_can_be_inspected(cconv, tmp_path):
     status, out, _ = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "a", *SMALL, "--seed", 5)
     assert status == 0
-    assert "64 particles" in out
+    assert "3 trajectories" in out
     status, out, _ = cconv("data", "inspect", tmp_path / "a")
     assert status == 0
     assert "taylor_green_2d" in out
@@ -62,8 +62,12 @@ def test_bad_settings_end_in_one_line(cconv, tmp_path):
     assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--force", "down"), "--force", "'down'")
     assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--force", "0,-1"), "force", "axis (3)")
     assert_one_clear_line(cconv("data", "inspect", tmp_path / "a", "--mass", "-1"), "mass", "positive")
-    outcome = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "b", "--trajectories", 1)
+    outcome = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "b", "--trajectories", 2)
     assert_one_clear_line(outcome, "num_trajectories")
+    outcome = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "b", "--time-step", 1)
+    assert_one_clear_line(outcome, "time_step", "speed of sound")
+    outcome = cconv("data", "generate", "taylor_gren_2d", "--out", tmp_path / "b")
+    assert_one_clear_line(outcome, "scene", "Did you mean 'taylor_green_2d'?")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a"]
 
 
@@ -84,18 +88,28 @@ def test_unknown_command_and_option_end_with_status_2(cconv, tmp_path):
         assert "Traceback" not in error
 
 
-def test_interruption_ends_with_status_130_and_leaves_nothing(cconv, tmp_path, monkeypatch):
+def test_scenes_are_listed_with_what_they_have(cconv):
+    status, out, _ = cconv("data", "scenes")
+    assert status == 0
+    assert "lid_driven_cavity_3d" in out
+    facts = json.loads(cconv("data", "scenes", "--json")[1])
+    dam = next(fact for fact in facts if fact["scene"] == "dam_break_2d")
+    assert dam["features"]["free_surface"]
+    assert dam["sizes"]["published"]["frames"] == 401
+
+
+def test_interruption_ends_with_status_130_and_leaves_no_data_set(cconv, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cconv.scenes.taylor_green_2d.TaylorGreen2D.advance", interrupt)
+    monkeypatch.setattr("cconv.sph.solver.WeaklyCompressibleSPH.step", interrupt)
     status, _, error = cconv("data", "generate", "taylor_green_2d", "--out", tmp_path / "a", *SMALL)
     assert status == 130
     assert "Traceback" not in error
-    assert list(tmp_path.iterdir()) == []
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.unfinished"]
 
 
-@pytest.mark.parametrize("command", [[], ["data"], ["data", "generate", "taylor_green_2d"], ["data", "inspect"]])
+@pytest.mark.parametrize("command", [[], ["data"], ["data", "generate"], ["data", "inspect"]])
 def test_help_is_given(cconv, command):
     status, out, _ = cconv(*command, "--help")
     assert status == 0

@@ -6,14 +6,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from cconv.cli.console import print_json, results, show_progress
+from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.errors import ConfigError
 
 # Commands import what they run inside, as torch takes seconds to load and `--help` should not.
 
 app = typer.Typer(help="Make, look at and convert particle data.", no_args_is_help=True)
-generate = typer.Typer(help="Make a data set of a scene, e.g. to try the rest of `cconv` on.", no_args_is_help=True)
-app.add_typer(generate, name="generate")
 
 DataFolder = Annotated[
     Path,
@@ -45,42 +43,92 @@ Force = Annotated[
 ]
 
 
-@generate.command("taylor_green_2d")
-def generate_taylor_green_2d(
+@app.command()
+def scenes(as_json: AsJson = False) -> None:
+    """List the scenes that `generate` makes, and what each has: walls, forces, a free surface ..."""
+    from cconv.scenes import SCENES, scene_named
+
+    facts = [
+        {
+            "scene": name,
+            "dim": scene.dim,
+            "source": scene.source,
+            "sizes": {size: _size_of(scene_named(name, size)) for size in scene.sizes},
+            "features": scene_named(name, "small").features,
+        }
+        for name, scene in SCENES.items()
+    ]
+    if as_json:
+        print_json(facts)
+        return
+    table = Table(title="Scenes; trajectories x frames at published size", title_justify="left")
+    table.add_column("scene", no_wrap=True)
+    table.add_column("size", no_wrap=True)
+    table.add_column("has")
+    for fact in facts:
+        has = ", ".join(name.replace("_", " ") for name, present in fact["features"].items() if present)
+        size = fact["sizes"]["published"]
+        table.add_row(fact["scene"], f"{size['trajectories']} x {size['frames']}", has)
+    results.print(table)
+
+
+def _size_of(scene) -> dict:
+    return {
+        "particle_spacing": scene.particle_spacing,
+        "time_step": scene.time_step,
+        "steps_per_frame": scene.steps_per_frame,
+        "frames": scene.num_frames,
+        "trajectories": scene.num_trajectories,
+    }
+
+
+@app.command()
+def generate(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene; `cconv data scenes` lists them.")],
     out: OutFolder,
+    size: Annotated[
+        str, typer.Option(help="'published' (hours for a whole set) or 'small' (seconds, for tests and quick studies).")
+    ] = "published",
     trajectories: Annotated[
-        int, typer.Option(help="How many simulations; split by simulation into train, valid and test.")
-    ] = 8,
-    frames: Annotated[int, typer.Option(help="Frames of each simulation.")] = 40,
-    particles_per_side: Annotated[
-        int, typer.Option(help="Particles along an axis of the box; the square of it is their number.")
-    ] = 30,
-    seed: Annotated[int, typer.Option(help="Seed; the same seed gives the same bytes.")] = 0,
-    viscosity: Annotated[float, typer.Option(help="Kinematic viscosity; the Reynolds number is its inverse.")] = 0.01,
-    frame_dt: Annotated[
-        float, typer.Option(help="Time between frames; 40 frames of 0.01 keep the particles evenly spread.")
-    ] = 0.01,
+        int | None,
+        typer.Option(help="How many simulations, split 2:1:1; a single one is cut in time. The size's own by default."),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames of each, the start included. The size's own by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the random starts; the same seed gives the same bytes.")] = 0,
+    workers: Annotated[int | None, typer.Option(help="Simulations side by side; as many as cores by default.")] = None,
+    particle_spacing: Spacing = None,
+    viscosity: Annotated[float | None, typer.Option(help="Kinematic viscosity.")] = None,
+    time_step: Annotated[
+        float | None, typer.Option(help="Step of the solver; refused where it breaks a CFL condition.")
+    ] = None,
+    steps_per_frame: Annotated[int | None, typer.Option(help="Steps of the solver between stored frames.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Particles in decaying Taylor-Green vortices, 2D, periodic.
+    """Make the data of a scene with the SPH solver, e.g. to train on or to try the rest of `cconv` with.
 
-    The flow is known exactly, so velocities are exact and generation takes seconds. Simulations differ in where the
-    vortices stand and how the particles start.
+    Finished simulations are kept in DIR.unfinished until all are done: after a kill, the same command goes on from there.
     """
-    from cconv.data.generate import generate_taylor_green_2d as run
+    from cconv.data.generate import generate as run
+    from cconv.scenes import scene_named
 
-    run(
+    settings = {"viscosity": viscosity, "steps_per_frame": steps_per_frame, "time_step": time_step}
+    chosen = scene_named(scene, size, particle_spacing=particle_spacing, **settings)
+    done = run(
+        chosen,
         out,
         num_trajectories=trajectories,
         num_frames=frames,
-        particles_per_side=particles_per_side,
         seed=seed,
-        viscosity=viscosity,
-        frame_dt=frame_dt,
+        workers=workers,
         overwrite=overwrite,
         progress=show_progress,
     )
-    results.print(f"{trajectories} trajectories of {frames} frames, {particles_per_side**2} particles: {out}")
+    for failure in done.failures:
+        errors.print(f"cconv: replaced a start that blew up: {failure}", markup=False, highlight=False, soft_wrap=True)
+    resumed = f", {done.reused} of them from an earlier run" if done.reused else ""
+    results.print(f"{trajectories or chosen.num_trajectories} trajectories{resumed}: {out}", soft_wrap=True)
 
 
 @app.command()

@@ -22,7 +22,7 @@ def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterato
         ConfigError: If the folder exists and must not be replaced, or cannot be written.
     """
     folder = folder.absolute()
-    _check_free(folder, set(files), overwrite)
+    check_free(folder, files, overwrite)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
@@ -34,7 +34,9 @@ def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterato
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _check_free(folder: Path, files: set[str], overwrite: bool) -> None:
+def check_free(folder: Path, files: Iterable[str], overwrite: bool) -> None:
+    """Raise `ConfigError` unless `folder` is empty, missing, or holds nothing but `files` that may be replaced."""
+    files = set(files)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; name a folder to write to.")
     present = {entry.name for entry in folder.iterdir()} if folder.exists() else set()

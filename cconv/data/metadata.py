@@ -116,6 +116,7 @@ def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> d
         "default_connectivity_radius": float(f"{1.45 * scene.particle_spacing:.2g}"),
         **statistics,
         OWN_KEY: {
+            **stored.get(OWN_KEY, {}),
             "name": scene.name,
             "force": list(scene.force) if scene.force else None,
             "mass_source": scene.mass_source,

@@ -42,4 +42,6 @@ def scene_named(name: str, size: str = "published", **settings) -> SimulatedScen
     scene = SCENES[name]
     check_choice("size", size, scene.sizes)
     given = {key: value for key, value in settings.items() if value is not None}
+    if given.keys() & {"particle_spacing", "viscosity"}:
+        given.setdefault("time_step", None)  # the size's own belongs to its own spacing and viscosity
     return scene(**{**scene.sizes[size], **given})

@@ -13,7 +13,7 @@ from torch import Tensor
 from cconv.domain import Box
 from cconv.scenes.relaxed import glass
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around
+from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class Cuboid3D(SimulatedScene):
 
     @property
     def _counts(self) -> list[int]:
-        return [round(self.side / self.particle_spacing)] * 3
+        return [whole_cells(self.side, self.particle_spacing)] * 3
 
     @property
     def box(self) -> Box:

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, walls_around
-from cconv.scenes.walls import lattice as cells_of
+from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +38,7 @@ class _LidDrivenCavity(SimulatedScene):
 
     @property
     def _counts(self) -> list[int]:
-        return [round(length / self.particle_spacing) for length in (1.0, 1.0, *self.depth)]
+        return [whole_cells(length, self.particle_spacing) for length in (1.0, 1.0, *self.depth)]
 
     @property
     def box(self) -> Box:
@@ -59,11 +58,13 @@ class _LidDrivenCavity(SimulatedScene):
 
     @property
     def _walls_at_rest(self) -> Walls:
-        return walls_around(self._counts, self.particle_spacing, self._corner, [True, True, *(False for _ in self.depth)])
+        return walls_around(
+            self._counts, self.particle_spacing, self._corner, [True, True, *(False for _ in self.depth)]
+        )
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice at rest."""
-        start = cells_of(self._counts, self.particle_spacing, self._corner)
+        start = lattice(self._counts, self.particle_spacing, self._corner)
         positions = self.relaxed(start, self.box, self._walls_at_rest, generator)
         return positions, torch.zeros_like(positions)
 

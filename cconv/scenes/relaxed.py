@@ -16,7 +16,9 @@ _JITTER = 0.3  # largest displacement from the lattice along an axis, in spacing
 _VISCOSITY = 0.2  # in spacings times the speed of sound: motion dies out within some tens of steps
 
 
-def relaxed(positions: Tensor, *, box: Box, walls: Walls, spacing: float, generator: torch.Generator, steps: int) -> Tensor:
+def relaxed(
+    positions: Tensor, *, box: Box, walls: Walls, spacing: float, generator: torch.Generator, steps: int
+) -> Tensor:
     """Positions (N, D), float64, shaken and spread evenly in a box that they fill.
 
     Args:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cconv.errors import ConfigError
+
 WALL_LAYERS = 3  # the quintic spline reaches three particle spacings
 
 
@@ -34,6 +36,21 @@ class Walls:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+def whole_cells(length: float, spacing: float) -> int:
+    """How many particles fill a length.
+
+    Raises:
+        ConfigError: If the spacing does not divide it.
+    """
+    cells = round(length / spacing)
+    if cells < 1 or abs(cells * spacing - length) > 1e-4 * spacing * cells:
+        raise ConfigError(
+            f"`particle_spacing` must divide the length {length:g} of the scene, got {spacing:g}; take "
+            f"{length / max(cells, 1):.6g}."
+        )
+    return cells
 
 
 def lattice(counts: Sequence[int], spacing: float, lower: Sequence[float]) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around
+from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class WaterColumn2D(SimulatedScene):
 
     @property
     def _counts(self) -> tuple[int, int]:
-        cells = round(1 / self.particle_spacing)
+        cells = whole_cells(1.0, self.particle_spacing)
         return cells, cells
 
     @property

@@ -16,7 +16,8 @@ def kernel_tables(kernel: AbstractKernel) -> tuple[np.ndarray, np.ndarray]:
     Within an interval the value is a cubic in the distance from its start, counted in intervals, highest power first.
     They differ from the kernel by less than 1e-7 of its largest value.
     """
-    nodes = np.linspace(0, kernel.support_radius, _INTERVALS + 1)
+    last = np.nextafter(kernel.support_radius, 0)  # at the support itself W is 0, which for some kernels is a jump
+    nodes = np.linspace(0, last, _INTERVALS + 1)
     width = kernel.support_radius / _INTERVALS
     powers = width ** np.arange(3, -1, -1)
     return tuple(

@@ -120,9 +120,7 @@ def density_rates(
             squared = dx * dx + dy * dy + dz * dz
             if 0 < squared < support * support:
                 distance = math.sqrt(squared)
-                approach = (
-                    (ux - velocities[j, 0]) * dx + (uy - velocities[j, 1]) * dy + (uz - velocities[j, 2]) * dz
-                )
+                approach = (ux - velocities[j, 0]) * dx + (uy - velocities[j, 1]) * dy + (uz - velocities[j, 2]) * dz
                 total += masses[j] / densities[j] * approach * look_up(slopes, distance * scale) / distance
         rates[i] = densities[i] * total
 

@@ -281,7 +281,10 @@ class WeaklyCompressibleSPH:
         if self._density == "summation":
             return self._summed(now)
         table, slopes = self._tables
-        rows, common = self._neighbors.rows(now), (now.positions, self._lengths, now.masses, self._kernel.support_radius)
+        rows, common = (
+            self._neighbors.rows(now),
+            (now.positions, self._lengths, now.masses, self._kernel.support_radius),
+        )
         rates = np.zeros_like(now.densities)
         rows.visit(pair_loops.density_rates, *common, slopes, now.is_wall, now.velocities, now.densities, rates)
         densities = now.densities + time_step * rates

@@ -1,87 +1,220 @@
+"""Generated data sets: same bytes for a seed, split, cut in time, resumed after a kill, never half-written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import pytest
 import torch
 
+from cconv.data import generate as module
 from cconv.data.dataset import open_dataset
-from cconv.data.generate import generate_taylor_green_2d
-from cconv.errors import ConfigError
+from cconv.data.generate import generate
+from cconv.data.simulate import simulate
+from cconv.errors import ConfigError, SimulationError
+from cconv.scenes import SCENES, scene_named
 
-SMALL = {"num_trajectories": 4, "num_frames": 5, "particles_per_side": 8}
+FILES = ("train.h5", "valid.h5", "test.h5", "metadata.json")
+LAGRANGEBENCH_KEYS = {
+    "case", "solver", "density_evolution", "dim", "dx", "dt", "t_end", "viscosity", "p_bg_factor", "g_ext_magnitude",
+    "artificial_alpha", "free_slip", "write_every", "is_bc_trick", "sequence_length_train", "num_trajs_train",
+    "sequence_length_test", "num_trajs_test", "num_particles_max", "periodic_boundary_conditions", "bounds",
+    "default_connectivity_radius", "vel_mean", "vel_std", "acc_mean", "acc_std",
+}  # fmt: skip
 
 
-def generate(folder, **settings):
-    generate_taylor_green_2d(folder, **{**SMALL, **settings})
-    return open_dataset(folder)
+def tiny(name="taylor_green_2d", **settings):
+    quick = {"relaxation_steps": 5, "steps_per_frame": 2, "skipped_frames": 0, **settings}
+    return scene_named(name, "small", **quick)
 
 
-def test_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path):
-    generate(tmp_path / "a", seed=1)
-    generate(tmp_path / "b", seed=1)
-    generate(tmp_path / "c", seed=2)
-    for name in ("train.h5", "valid.h5", "test.h5"):
+def made(folder, scene=None, **settings):
+    done = generate(scene or tiny(), folder, **{"num_trajectories": 4, "num_frames": 4, "workers": 1, **settings})
+    return open_dataset(folder), done
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_becomes_a_data_set(name, tmp_path):
+    scene = tiny(name)
+    count = 1 if scene.num_trajectories == 1 else 3
+    dataset, _ = made(tmp_path / "a", scene, num_trajectories=count, num_frames=4)
+    metadata = json.loads((tmp_path / "a" / "metadata.json").read_text())
+    assert set(metadata) == LAGRANGEBENCH_KEYS | {"cconv"}
+    assert metadata["cconv"]["features"] == scene.features
+    assert dataset.scene.name == name
+    assert dataset.scene.velocity_source == dataset.scene.mass_source == "stored"
+    assert dataset.scene.has_boundary == scene.features["walls"]
+    assert dataset.scene.frame_dt == pytest.approx(scene.frame_dt)
+    trajectory = dataset.trajectory("test", 0)
+    assert (trajectory.viscosities is not None) == scene.features["varying_viscosity"]
+    assert torch.isfinite(trajectory.velocities).all()
+    assert (dataset.scene.force is None) == (scene.gravity is None)
+    assert any(line.startswith("force:") for line in dataset.scene.missing) == (
+        scene.has_force and scene.gravity is None
+    )
+
+
+def test_same_seed_gives_the_same_bytes_whatever_the_workers_and_another_seed_others(tmp_path):
+    made(tmp_path / "a", seed=1)
+    made(tmp_path / "b", seed=1, workers=2)
+    made(tmp_path / "c", seed=2)
+    for name in FILES:
         first, again, other = ((tmp_path / folder / name).read_bytes() for folder in "abc")
-        assert first == again != other
-    assert (tmp_path / "a" / "metadata.json").read_bytes() == (tmp_path / "b" / "metadata.json").read_bytes()
+        assert first == again
+        assert name == "metadata.json" or again != other
 
 
-def test_sizes_are_as_asked_for(tmp_path):
-    dataset = generate(tmp_path / "a")
+def test_trajectories_are_split_two_to_one_to_one(tmp_path):
+    dataset, _ = made(tmp_path / "a")
     assert {split: len(blocks) for split, blocks in dataset.splits.items()} == {"train": 2, "valid": 1, "test": 1}
-    trajectory = dataset.trajectory("train", 1)
-    assert trajectory.positions.shape == (5, 64, 2)
-    assert trajectory.positions.dtype == torch.float32
-    assert (trajectory.positions >= 0).all()
-    assert (trajectory.positions < 1).all()
+    starts = [dataset.trajectory(split, k).positions[0] for split, k in (("train", 0), ("train", 1), ("test", 0))]
+    assert not torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[1], starts[2])
 
 
-def test_scene_lacks_nothing(tmp_path):
-    scene = generate(tmp_path / "a").scene
-    assert scene.missing == ()
-    assert scene.velocity_source == scene.mass_source == "stored"
-    assert scene.box.periodic == (True, True)
-    assert scene.particle_spacing == 1 / 8
-    assert scene.frame_dt == 0.01
+def test_a_single_trajectory_is_cut_in_time(tmp_path):
+    whole = _whole(tiny("reverse_poiseuille_2d"), 8)
+    dataset, _ = made(tmp_path / "a", tiny("reverse_poiseuille_2d"), num_trajectories=1, num_frames=8)
+    parts = [dataset.trajectory(split, 0).positions for split in ("train", "valid", "test")]
+    assert [len(part) for part in parts] == [4, 2, 2]
+    assert torch.equal(torch.cat(parts), whole.positions)
 
 
-def test_no_two_trajectories_are_alike(tmp_path):
-    dataset = generate(tmp_path / "a")
-    starts = [
-        dataset.trajectory(split, k).positions[0] for split in dataset.splits for k in range(len(dataset.splits[split]))
-    ]
-    assert len({tuple(start.flatten().tolist()) for start in starts}) == 4
+def test_frames_before_the_first_stored_are_skipped():
+    skipping = _whole(tiny("reverse_poiseuille_2d", skipped_frames=3), 2)
+    whole = _whole(tiny("reverse_poiseuille_2d"), 5)
+    assert torch.equal(skipping.positions, whole.positions[3:])
 
 
-def test_total_mass_is_that_of_the_box_filled_with_density_one(tmp_path):
-    masses = generate(tmp_path / "a").trajectory("train", 0).masses
-    assert float(masses.sum()) == pytest.approx(1.0)
+def _whole(scene, frames):
+    going = simulate(scene, frames, 0, 0)
+    try:
+        while True:
+            next(going)
+    except StopIteration as end:
+        return end.value
 
 
 def test_stored_velocities_are_those_the_particles_move_with(tmp_path):
-    dataset = generate(tmp_path / "a", frame_dt=1e-3)
+    dataset, _ = made(tmp_path / "a", tiny(steps_per_frame=1), num_frames=6)
+    trajectory, scene = dataset.trajectory("train", 0), dataset.scene
+    steps = scene.box.displacement(trajectory.positions[1:], trajectory.positions[:-1]) / scene.frame_dt
+    torch.testing.assert_close(steps, trajectory.velocities[1:], rtol=0.0, atol=2e-3)
+
+
+def test_walls_are_stored_first_and_move_with_their_velocity(tmp_path):
+    dataset, _ = made(tmp_path / "a", tiny("lid_driven_cavity_2d"), num_trajectories=1)
     trajectory = dataset.trajectory("train", 0)
-    steps = dataset.scene.box.displacement(trajectory.positions[2:].double(), trajectory.positions[:-2].double())
-    torch.testing.assert_close(steps / 2e-3, trajectory.velocities[1:-1].double(), rtol=0, atol=1e-3)
+    types = trajectory.particle_types
+    assert types.tolist() == sorted(types.tolist(), key=lambda kind: kind == 0)
+    moving = trajectory.velocities[:, types == 2]
+    assert torch.equal(moving, torch.tensor([1.0, 0.0]).expand_as(moving))
+    assert not trajectory.velocities[:, types == 1].any()
 
 
-@pytest.mark.parametrize(
-    ("settings", "name"),
-    [
+def test_a_start_that_blows_up_is_replaced_and_told(tmp_path, monkeypatch):
+    blown = []
+
+    def fail_once(state, scene):
+        if not blown:
+            blown.append(state)
+            raise SimulationError("The simulation blew up at step 2.")
+
+    monkeypatch.setattr("cconv.data.simulate._check_speed", fail_once)
+    _, done = made(tmp_path / "a")
+    assert len(done.failures) == 1
+    assert done.failures[0].startswith("trajectory 0, start 1: The simulation blew up")
+
+
+def test_a_scene_that_always_blows_up_gives_no_data(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "cconv.scenes.taylor_green.TaylorGreen2D.velocity", lambda self, x, time: 1e3 * torch.ones_like(x)
+    )
+    with pytest.raises(SimulationError, match="All 5 starts of trajectory 0 blew up.*faster than sound"):
+        made(tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_finished_trajectories_are_not_computed_again(tmp_path, monkeypatch):
+    real, computed = module.simulate, []
+
+    def counted(scene, frames, seed, index):
+        computed.append(index)
+        if len(computed) == 3:
+            raise KeyboardInterrupt
+        return (yield from real(scene, frames, seed, index))
+
+    monkeypatch.setattr(module, "simulate", counted)
+    with pytest.raises(KeyboardInterrupt):
+        made(tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+    _, done = made(tmp_path / "a")
+    assert computed == [0, 1, 2, 2, 3]
+    assert done.reused == 2
+    made(tmp_path / "b")
+    assert [(tmp_path / "a" / name).read_bytes() for name in FILES] == [
+        (tmp_path / "b" / name).read_bytes() for name in FILES
+    ]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_unfinished_trajectories_of_other_settings_are_not_mixed_in(tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(module, "_splits", stop)
+        made(tmp_path / "a", seed=1)
+    with pytest.raises(ConfigError, match="a.unfinished: holds the unfinished trajectories of another"):
+        made(tmp_path / "a", seed=2)
+    made(tmp_path / "a", seed=2, overwrite=True)
+    made(tmp_path / "b", seed=2)
+    assert (tmp_path / "a" / "train.h5").read_bytes() == (tmp_path / "b" / "train.h5").read_bytes()
+
+
+def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
+    """`kill -9` of the whole process group; the command that is given again redoes no finished trajectory."""
+    command = [
+        Path(sys.executable).parent / "cconv", "data", "generate", "taylor_green_2d", "--size", "small", "--out",
+        tmp_path / "a", "--trajectories", "6", "--frames", "20", "--workers", "2",
+    ]  # fmt: skip
+    running = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    unfinished = tmp_path / "a.unfinished"
+    deadline = time.monotonic() + 60
+    while len(list(unfinished.glob("*.safetensors"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(running.pid, signal.SIGKILL)
+    running.wait()
+    kept = list(unfinished.glob("*.safetensors"))
+    assert 2 <= len(kept) < 6
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert finished.returncode == 0, finished.stderr
+    assert f"6 trajectories, {len(kept)} of them from an earlier run" in finished.stdout
+    assert len(open_dataset(tmp_path / "a").splits["train"]) == 2
+    assert not unfinished.exists()
+
+
+def test_numbers_that_cannot_be_are_refused(tmp_path):
+    for settings, message in (
         ({"num_trajectories": 2}, "num_trajectories"),
+        ({"num_trajectories": 0}, "num_trajectories"),
         ({"num_frames": 0}, "num_frames"),
-        ({"particles_per_side": 3}, "particles_per_side"),
-        ({"viscosity": -1.0}, "viscosity"),
-        ({"frame_dt": 0.0}, "frame_dt"),
-        ({"jitter": 0.6}, "jitter"),
-    ],
-)
-def test_settings_that_cannot_be_are_named_and_nothing_is_written(tmp_path, settings, name):
-    with pytest.raises(ConfigError, match=f"`{name}`"):
-        generate(tmp_path / "a", **settings)
+        ({"num_trajectories": 1, "num_frames": 2}, "num_frames"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            made(tmp_path / "a", **settings)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_existing_folder_is_refused_unless_overwritten(tmp_path):
-    before = generate(tmp_path / "a", seed=1).fingerprint()
-    with pytest.raises(ConfigError, match="overwrite"):
-        generate(tmp_path / "a", seed=2)
-    assert open_dataset(tmp_path / "a").fingerprint() == before
-    assert generate(tmp_path / "a", seed=2, overwrite=True).fingerprint() != before
+def test_an_older_data_set_is_kept_unless_overwritten(tmp_path):
+    made(tmp_path / "a")
+    before = (tmp_path / "a" / "train.h5").read_bytes()
+    with pytest.raises(ConfigError, match="not empty"):
+        made(tmp_path / "a", seed=1)
+    assert (tmp_path / "a" / "train.h5").read_bytes() == before
+    made(tmp_path / "a", seed=1, overwrite=True)
+    assert (tmp_path / "a" / "train.h5").read_bytes() != before

@@ -1,0 +1,282 @@
+"""Laws of the solver: conservation, symmetry, hydrostatics, exact channel flows, agreement with the operators."""
+
+import math
+
+import pytest
+import torch
+
+from cconv import Box, radius_graph
+from cconv.errors import ConfigError, ShapeError, SimulationError
+from cconv.scenes.walls import lattice, walls_around
+from cconv.sph import KERNELS, QuinticSpline, density, density_rate
+from cconv.sph.kernel_table import kernel_tables, look_up
+from cconv.sph.solver import EquationOfState, WeaklyCompressibleSPH, check_time_step, largest_time_step
+
+SPACING = 0.1
+BOX = Box((0.0, 0.0), (1.0, 1.0), periodic=True)
+
+
+def shaken(generator, box=BOX, jitter=0.3, spacing=SPACING):
+    counts = [round(length / spacing) for length in box.lengths]
+    positions = lattice(counts, spacing, box.lower)
+    return box.wrap(positions + jitter * spacing * (2 * torch.rand(positions.shape, generator=generator).double() - 1))
+
+
+def solver_in(box=BOX, spacing=SPACING, kernel=None, **settings):
+    settings.setdefault("equation_of_state", EquationOfState(sound_speed=10.0))
+    kernel = kernel or QuinticSpline(spacing, box.dim)
+    return WeaklyCompressibleSPH(kernel=kernel, box=box, particle_spacing=spacing, **settings)
+
+
+def state_of(solver, positions, velocities=None, walls=0, viscosity=0.01):
+    """The last `walls` particles are walls."""
+    particles, dim = positions.shape
+    return solver.initial_state(
+        positions,
+        torch.zeros_like(positions) if velocities is None else velocities,
+        masses=torch.full((particles,), solver.particle_spacing**dim),
+        viscosities=torch.full((particles,), viscosity),
+        is_wall=torch.arange(particles) >= particles - walls,
+    )
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_tables_are_the_kernel(name):
+    kernel = KERNELS[name](0.3, 2)
+    r = torch.linspace(0, 0.999 * kernel.support_radius, 1001, dtype=torch.float64)
+    for table, exact in zip(kernel_tables(kernel), (kernel.value(r), kernel.derivative(r)), strict=True):
+        places = (r * len(table) / kernel.support_radius).tolist()
+        found = torch.tensor([look_up.py_func(table, place) for place in places])
+        assert (found - exact).abs().max() < 1e-6 * exact.abs().max()
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_summed_density_is_the_operators(dim, generator):
+    box = Box((0.0,) * dim, (1.0,) * dim, periodic=True)
+    solver = solver_in(box)
+    state = state_of(solver, shaken(generator, box))
+    edges = radius_graph(state.positions, 0.3, box)
+    torch.testing.assert_close(
+        state.densities, density(state.masses, edges, QuinticSpline(SPACING, dim)), rtol=1e-6, atol=0.0
+    )
+
+
+def test_density_evolves_by_the_rate_of_density(generator):
+    # With equal densities m_j/ρ_j ρ_i = m_j: the continuity equation is D2.
+    solver = solver_in(density="evolution")
+    positions = shaken(generator)
+    velocities = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
+    before = state_of(solver, positions, velocities)
+    after = solver.step(before, 1e-6)
+    edges = radius_graph(after.positions, 0.3, BOX)
+    rate = density_rate(after.masses, after.velocities, edges, QuinticSpline(SPACING, 2))
+    torch.testing.assert_close((after.densities - before.densities) / 1e-6, rate, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("density_scheme", ["summation", "evolution"])
+@pytest.mark.parametrize("transport", [0.0, 100.0])
+def test_momentum_is_conserved_without_walls_and_forces(density_scheme, transport, generator):
+    solver = solver_in(density=density_scheme, transport_pressure=transport, artificial_viscosity=0.1)
+    positions = shaken(generator)
+    velocities = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
+    state = state_of(solver, positions, velocities)
+    before = state.velocities.sum(dim=0)
+    for _ in range(50):
+        state = solver.step(state, 1e-3)
+    assert (state.velocities.sum(dim=0) - before).abs().max() < 1e-11
+    assert not torch.equal(state.velocities, velocities)
+
+
+def test_a_lattice_at_rest_stays(generator):
+    solver = solver_in(transport_pressure=100.0)
+    start = lattice((10, 10), SPACING, (0.0, 0.0))
+    state = state_of(solver, start)
+    for _ in range(20):
+        state = solver.step(state, 1e-3)
+    assert (state.positions - start).abs().max() < 1e-9
+
+
+def test_transport_velocity_moves_particles_apart_and_their_centre_not(generator):
+    positions = shaken(generator)
+    without = solver_in()
+    alone = without.step(state_of(without, positions), 1e-3)
+    assert torch.equal(alone.transport_velocities, alone.velocities)
+    solver = solver_in(transport_pressure=100.0)
+    state = solver.step(state_of(solver, positions), 1e-3)
+    shifts = state.transport_velocities - state.velocities
+    edges = radius_graph(positions, 0.07, BOX)  # close pairs
+    apart = ((shifts[edges.receivers] - shifts[edges.senders]) * edges.displacements).sum(dim=1)
+    assert shifts.sum(dim=0).abs().max() < 1e-12
+    assert len(edges) > 10
+    assert (apart > 0).double().mean() > 0.8
+
+
+def test_motion_does_not_depend_on_how_often_neighbours_are_searched_nor_on_threads(generator):
+    positions = shaken(generator)
+    velocities = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
+
+    def run(skin):
+        solver = solver_in(skin=skin)
+        state = state_of(solver, positions, velocities)
+        for _ in range(40):
+            state = solver.step(state, 2e-3)
+        return state.positions
+
+    threads = torch.get_num_threads()
+    often, seldom = run(0.05), run(1.0)
+    torch.set_num_threads(1)
+    alone = run(1.0)
+    torch.set_num_threads(threads)
+    assert torch.equal(often, seldom)
+    assert torch.equal(alone, seldom)
+
+
+def test_rotated_scenes_give_rotated_motion(generator):
+    """A quarter turn and a mirror are symmetries of the lattice box; only rounding differs."""
+    box = Box((-5.0, -5.0), (5.0, 5.0))
+    disc = lattice((14, 14), SPACING, (-0.7, -0.7))
+    disc = disc[disc.norm(dim=1) < 0.6] + 0.02 * torch.rand((), generator=generator)
+    velocities = torch.randn(disc.shape, generator=generator, dtype=torch.float64)
+    turn = torch.tensor([[math.cos(0.4), -math.sin(0.4)], [-math.sin(0.4), -math.cos(0.4)]], dtype=torch.float64)
+
+    def run(positions, velocities):
+        solver = solver_in(box, density="evolution", artificial_viscosity=0.2)
+        state = state_of(solver, positions, velocities)
+        for _ in range(30):
+            state = solver.step(state, 1e-3)
+        return state.positions
+
+    torch.testing.assert_close(
+        run(disc @ turn.T, velocities @ turn.T), run(disc, velocities) @ turn.T, rtol=0, atol=1e-9
+    )
+
+
+def test_hydrostatic_pressure_holds_the_water_up():
+    """Exact hydrostatic densities on a lattice over a bottom: no acceleration away from the surface."""
+    spacing, sound_speed = 0.05, 10.0
+    width, height = 10, 20
+    fluid = lattice((width, height), spacing, (0.0, 0.0))
+    walls = walls_around((width, height), spacing, (0.0, 0.0), [False, True])
+    box = Box((0.0, -0.2), (width * spacing, 1.5), periodic=(True, False))
+    gravity = torch.tensor([0.0, -1.0], dtype=torch.float64)
+    solver = solver_in(
+        box, spacing, density="evolution", equation_of_state=EquationOfState(sound_speed=sound_speed),
+        force=lambda positions: gravity.expand_as(positions),
+    )  # fmt: skip
+    bottom = walls.positions[walls.positions[:, 1] < 0]
+    state = state_of(solver, torch.cat([fluid, bottom]), walls=len(bottom))
+    state.densities[: len(fluid)] = 1 + (1 - fluid[:, 1]) / sound_speed**2
+    accelerations = (solver.step(state, 1e-4).velocities - state.velocities) / 1e-4
+    deep = fluid[:, 1] < 0.8
+    assert accelerations[: len(fluid)][deep].norm(dim=1).max() < 0.04
+
+
+def channel(wall_friction=True, lid_speed=0.0, force=0.0, viscosity=0.1, time=0.5, cells=20, background=0.0):
+    """Profile (cells,) of a channel of height 1, periodic along x, that starts at rest."""
+    spacing, columns = 1 / cells, 8
+    fluid = lattice((columns, cells), spacing, (0.0, 0.0))
+    walls = walls_around((columns, cells), spacing, (0.0, 0.0), [False, True])
+    box = Box((0.0, -3 * spacing), (columns * spacing, 1 + 3 * spacing), periodic=(True, False))
+    push = torch.tensor([force, 0.0], dtype=torch.float64)
+    eos = EquationOfState(sound_speed=10.0, background_pressure=background * 100.0)
+    solver = solver_in(
+        box, spacing, equation_of_state=eos, wall_friction=wall_friction,
+        force=(lambda positions: push.expand_as(positions)) if force else None,
+        transport_pressure=eos.reference_pressure,
+    )  # fmt: skip
+    velocities = torch.zeros(len(fluid) + len(walls), 2, dtype=torch.float64)
+    velocities[len(fluid) :, 0] = lid_speed * (walls.positions[:, 1] > 1)
+    state = state_of(solver, torch.cat([fluid, walls.positions]), velocities, walls=len(walls), viscosity=viscosity)
+    step = largest_time_step(particle_spacing=spacing, sound_speed=10.0, reference_speed=1.0, viscosity=viscosity)
+    steps = round(time / step)
+    for _ in range(steps):
+        state = solver.step(state, time / steps)
+    heights, speeds = state.positions[: len(fluid), 1], state.velocities[: len(fluid), 0]
+    return heights, speeds
+
+
+def couette(y, time, viscosity, speed):
+    """Morris, Fox, Zhu, J. Comput. Phys. 136 (1997), eq. 25."""
+    terms = (
+        2 / (n * math.pi) * (-1) ** n * torch.sin(n * math.pi * y) * math.exp(-viscosity * (n * math.pi) ** 2 * time)
+        for n in range(1, 60)
+    )
+    return speed * (y + sum(terms))
+
+
+def poiseuille(y, time, viscosity, force):
+    """Morris, Fox, Zhu, J. Comput. Phys. 136 (1997), eq. 21."""
+    terms = (
+        4 * force / (viscosity * (math.pi * n) ** 3) * torch.sin(n * math.pi * y)
+        * math.exp(-viscosity * (n * math.pi) ** 2 * time)
+        for n in range(1, 60, 2)
+    )  # fmt: skip
+    return force / (2 * viscosity) * y * (1 - y) - sum(terms)
+
+
+@pytest.mark.parametrize("time", [0.3, 2.0])
+def test_couette_flow_follows_its_series(time):
+    heights, speeds = channel(lid_speed=1.0, time=time)
+    assert (speeds - couette(heights, time, 0.1, 1.0)).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("time", [0.3, 2.0])
+def test_poiseuille_flow_follows_its_series(time):
+    heights, speeds = channel(force=0.8, time=time)
+    exact = poiseuille(heights, time, 0.1, 0.8)
+    assert (speeds - exact).abs().max() < 0.02 * exact.max()
+
+
+def test_walls_that_let_slip_hold_nothing():
+    heights, speeds = channel(force=0.8, time=0.3, wall_friction=False)
+    torch.testing.assert_close(speeds, torch.full_like(speeds, 0.24), rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 7.0])
+def test_equation_of_state_has_its_inverse_and_the_speed_of_sound(exponent):
+    eos = EquationOfState(rest_density=2.0, sound_speed=3.0, exponent=exponent, background_pressure=0.5)
+    densities = torch.linspace(1.9, 2.1, 5, dtype=torch.float64).numpy()
+    assert eos.density(eos.pressure(densities)) == pytest.approx(densities)
+    slope = (eos.pressure(densities[2] + 1e-6) - eos.pressure(densities[2] - 1e-6)) / 2e-6
+    assert slope == pytest.approx(eos.sound_speed**2)
+
+
+def test_renormalisation_gives_the_summed_density_inside(generator):
+    """Evolved densities that have drifted by a factor return to what the particles' masses and places say."""
+    solver = solver_in(density="evolution", renormalize_every=1)
+    state = state_of(solver, lattice((10, 10), SPACING, (0.0, 0.0)))
+    state.densities.mul_(0.97)
+    torch.testing.assert_close(solver.step(state, 1e-9).densities, torch.ones(100).double(), rtol=1e-3, atol=0.0)
+
+
+def test_time_step_limits_name_their_condition():
+    scales = {"particle_spacing": 0.1, "sound_speed": 10.0, "reference_speed": 1.0}
+    assert largest_time_step(**scales) == pytest.approx(0.25 * 0.1 / 11)
+    assert largest_time_step(**scales, viscosity=5.0) == pytest.approx(0.25 * 0.01 / 5)
+    check_time_step(largest_time_step(**scales, force=1e6), **scales, force=1e6)
+    for setting, word in (({}, "sound"), ({"viscosity": 5.0}, "viscosity"), ({"force": 1e6}, "force")):
+        with pytest.raises(ConfigError, match=rf"`time_step` must be .* {word}.*got 0\.1"):
+            check_time_step(0.1, **scales, **setting)
+
+
+def test_bad_input_is_refused(generator):
+    solver = solver_in(Box((0.0, 0.0), (1.0, 1.0)))
+    outside = torch.tensor([[0.5, 0.5], [1.5, 0.5]], dtype=torch.float64)
+    with pytest.raises(ConfigError, match=r"within the box, got 1 outside, the first is particle 1 at \(1.5, 0.5\)"):
+        state_of(solver, outside)
+    with pytest.raises(ConfigError, match="particles 0 and 1 at a distance of 0.001"):
+        state_of(solver, torch.tensor([[0.5, 0.5], [0.501, 0.5]], dtype=torch.float64))
+    with pytest.raises(ShapeError, match="velocities"):
+        state_of(solver, outside / 2, torch.zeros(3, 2))
+    with pytest.raises(ConfigError, match="summation, evolution"):
+        solver_in(density="sumation")
+    with pytest.raises(ConfigError, match="renormalize_every"):
+        solver_in(renormalize_every=5)
+
+
+def test_a_blown_up_simulation_is_told(generator):
+    solver = solver_in(Box((0.0, 0.0), (1.0, 1.0)))
+    positions = shaken(generator, Box((0.2, 0.2), (0.8, 0.8)))
+    velocities = 1e3 * torch.ones_like(positions)
+    with pytest.raises(SimulationError, match="step 1: .* no longer in the box"):
+        solver.step(state_of(solver, positions, velocities), 1e-2)
