@@ -129,6 +129,92 @@ def convert(
     results.print(f"{path} as LagrangeBench HDF5: {out}")
 
 
+@app.command()
+def show(
+    path: DataFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Picture to write; the data folder's name.png here if not given."),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Split of the trajectory: train, valid or test.")] = "test",
+    trajectory: Annotated[int, typer.Option(help="Number of the trajectory in its split, from 0.")] = 0,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="K,K,...", help="Frames of the picture, from 0, e.g. 0,50,100; four evenly spaced else."),
+    ] = None,
+    color: Annotated[
+        str,
+        typer.Option(
+            metavar="speed|density|type",
+            help="What colours show: speed; deviation of the SPH density from rest, in percent, which is negative at "
+            "free surfaces and beside boundary points as nothing is summed there; particle type.",
+        ),
+    ] = "speed",
+    animate: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.gif|FILE.mp4", help="Animation to write, 20 frames a second; MP4 needs ffmpeg."),
+    ] = None,
+    every: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Animation and VTK files take every N-th frame of the trajectory.")
+    ] = 1,
+    vtk: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of VTK files to write; in ParaView open the .vtu.series in it and choose Point Gaussian.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace older VTK files in the folder.")] = False,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+) -> None:
+    """Draw frames of a trajectory side by side as PNG; animate them; export them for ParaView.
+
+    Particles are as large as their spacing. One scale of colours holds for all frames of a file.
+    """
+    from cconv.data.vtk import write_vtk
+    from cconv.report import particles
+
+    picture = Path(f"{path.resolve().name}.png") if out is None else out
+    particles.check_picture_name(picture)
+    if animate is not None:
+        particles.animation_writer(animate)
+    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    shown = dataset.trajectory(split, trajectory)
+    chosen = evenly_spaced(len(shown), 4) if frames is None else parse_frames(frames)
+    figure = particles.frames_chart(shown, dataset.scene, chosen, color, show_progress)
+    sequence = range(0, len(shown), every)
+    if vtk is not None:
+        series = write_vtk(vtk, shown, dataset.scene, sequence, overwrite, show_progress)
+        results.print(f"{len(sequence)} frames for ParaView: {series}")
+    if animate is not None:
+        particles.write_animation(animate, shown, dataset.scene, sequence, color, show_progress)
+        results.print(f"Animation of {len(sequence)} frames: {animate}")
+    particles.write_picture(figure, picture)
+    results.print(f"Picture of {len(chosen)} frames: {picture}")
+
+
+def evenly_spaced(num_frames: int, count: int) -> list[int]:
+    """Up to `count` different frames from the first to the last."""
+    return sorted({round(k * (num_frames - 1) / (count - 1)) for k in range(count)})
+
+
+def parse_frames(text: str) -> list[int]:
+    """Frame numbers separated by commas.
+
+    Raises:
+        ConfigError: If one is not a whole number.
+    """
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(
+            f"`--frames` must be whole numbers separated by commas, such as 0,50,100, got {text!r}."
+        ) from error
+
+
 def parse_vector(text: str) -> tuple[float, ...]:
     """Numbers separated by commas.
 
