@@ -146,8 +146,8 @@ def show(
         str,
         typer.Option(
             metavar="speed|density|type",
-            help="What colours show: speed; deviation of the SPH density from rest, in percent, which is negative at "
-            "free surfaces and beside boundary points as nothing is summed there; particle type.",
+            help="What colours show: speed; deviation of the SPH density from rest in percent (negative at a free "
+            "surface and beside thin walls, where particles are missing in the sum); or particle type.",
         ),
     ] = "speed",
     animate: Annotated[
@@ -155,7 +155,7 @@ def show(
         typer.Option(metavar="FILE.gif|FILE.mp4", help="Animation to write, 20 frames a second; MP4 needs ffmpeg."),
     ] = None,
     every: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Animation and VTK files take every N-th frame of the trajectory.")
+        int, typer.Option(metavar="N", help="Animation and VTK files take every N-th frame of the trajectory.")
     ] = 1,
     vtk: Annotated[
         Path | None,
@@ -172,7 +172,8 @@ def show(
 ) -> None:
     """Draw frames of a trajectory side by side as PNG; animate them; export them for ParaView.
 
-    Particles are as large as their spacing. One scale of colours holds for all frames of a file.
+    Particles are as large as the fluid they stand for. One scale of colours holds for all frames of a file; values
+    beyond its pointed ends are outliers.
     """
     from cconv.data.vtk import write_vtk
     from cconv.report import particles
@@ -181,6 +182,8 @@ def show(
     particles.check_picture_name(picture)
     if animate is not None:
         particles.animation_writer(animate)
+    if every < 1:
+        raise ConfigError(f"`--every` must be at least 1, got {every}.")
     dataset = _open(path, mass, particle_spacing, frame_dt, force)
     shown = dataset.trajectory(split, trajectory)
     chosen = evenly_spaced(len(shown), 4) if frames is None else parse_frames(frames)
