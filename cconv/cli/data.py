@@ -172,8 +172,7 @@ def show(
 ) -> None:
     """Draw frames of a trajectory side by side as PNG; animate them; export them for ParaView.
 
-    Particles are as large as the fluid they stand for. One scale of colours holds for all frames of a file; values
-    beyond its pointed ends are outliers.
+    All frames of a file share one scale of colours; outliers are beyond its pointed ends.
     """
     from cconv.data.vtk import write_vtk
     from cconv.report import particles
