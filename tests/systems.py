@@ -5,7 +5,7 @@ import math
 import torch
 
 from cconv.data.targets import Sample, make_sample
-from cconv.data.trajectory import Boundary, Frame, Scene
+from cconv.data.trajectory import Boundary, Frame, Scene, Trajectory
 from cconv.domain import Box
 from cconv.sph.kernels import CubicSpline
 from cconv.study.problem import Problem
@@ -43,6 +43,20 @@ def periodic_frame(generator: torch.Generator, particles_per_side: int = 8) -> F
         velocities=velocities.float(),
         masses=torch.full((particles,), spacing**2),
         particle_types=torch.zeros(particles, dtype=torch.int64),
+        boundary=None,
+    )
+
+
+def periodic_trajectory(generator: torch.Generator, num_frames: int = 3, particles_per_side: int = 8) -> Trajectory:
+    """Independent frames of the periodic scene."""
+    frames = [periodic_frame(generator, particles_per_side) for _ in range(num_frames)]
+    return Trajectory(
+        name="0",
+        first_frame=0,
+        positions=torch.stack([frame.positions for frame in frames]),
+        velocities=torch.stack([frame.velocities for frame in frames]),
+        masses=frames[0].masses,
+        particle_types=frames[0].particle_types,
         boundary=None,
     )
 

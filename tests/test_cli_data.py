@@ -47,6 +47,50 @@ def test_convert_keeps_what_was_given(cconv, tmp_path):
     assert open_dataset(tmp_path / "b").trajectory("train", 0).masses.tolist() == [0.5] * 5
 
 
+def test_show_writes_picture_animation_and_files_for_paraview(cconv, tmp_path, flow_folder):
+    outputs = ["--out", tmp_path / "a.png", "--animate", tmp_path / "a.gif", "--vtk", tmp_path / "vtk"]
+    status, out, _ = cconv("data", "show", flow_folder, *outputs, "--every", 2, "--frames", "0,3", "--color", "density")
+    assert status == 0
+    assert "Picture of 2 frames" in out
+    assert "Animation of 2 frames" in out
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.gif", "a.png", "vtk"]
+    assert len(list((tmp_path / "vtk").glob("*.vtu"))) == 2
+    assert len(list((tmp_path / "vtk").glob("*.vtu.series"))) == 1
+
+
+def test_show_names_the_picture_after_the_folder(cconv, tmp_path, flow_folder, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = cconv("data", "show", flow_folder, "--split", "train")
+    assert status == 0
+    assert "Picture of 4 frames" in out
+    assert [entry.name for entry in tmp_path.iterdir()] == ["flow.png"]
+
+
+def test_show_draws_what_lacks_mass_and_spacing(cconv, tmp_path):
+    write_parts(tmp_path / "a")
+    given = ["--mass", 0.5, "--particle-spacing", 0.1, "--frame-dt", 0.5]
+    status, _, _ = cconv("data", "show", tmp_path / "a", *given, "--color", "density", "--out", tmp_path / "a.png")
+    assert status == 0
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_show_refuses_in_one_line_and_writes_nothing(cconv, tmp_path, flow_folder):
+    outputs = ["--out", tmp_path / "a.png", "--animate", tmp_path / "a.gif", "--vtk", tmp_path / "vtk"]
+    for wrong, *words in (
+        (["--split", "tests"], "'tests'", "Did you mean 'test'"),
+        (["--trajectory", 9], "trajectories", "got 9"),
+        (["--frames", "0,4"], "frames", "from 0 to 3", "got 4"),
+        (["--frames", "first"], "--frames", "'first'"),
+        (["--color", "pressure"], "color", "speed, density, type", "'pressure'"),
+        (["--every", 0], "--every", "got 0"),
+        (["--out", tmp_path / "a.pdf"], "a.pdf", ".png"),
+        (["--animate", tmp_path / "a.webm"], "a.webm", ".gif or .mp4"),
+        (["--vtk", flow_folder], "not empty"),
+    ):
+        assert_one_clear_line(cconv("data", "show", flow_folder, *outputs, *wrong), *words)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_bad_data_ends_in_one_line(cconv, tmp_path):
     assert_one_clear_line(cconv("data", "inspect", tmp_path / "nowhere"), "nowhere", "does not exist")
     assert_one_clear_line(cconv("data", "inspect", tmp_path), "looked for")
@@ -109,7 +153,7 @@ def test_interruption_ends_with_status_130_and_leaves_no_data_set(cconv, tmp_pat
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.unfinished"]
 
 
-@pytest.mark.parametrize("command", [[], ["data"], ["data", "generate"], ["data", "inspect"]])
+@pytest.mark.parametrize("command", [[], ["data"], ["data", "generate"], ["data", "inspect"], ["data", "show"]])
 def test_help_is_given(cconv, command):
     status, out, _ = cconv(*command, "--help")
     assert status == 0

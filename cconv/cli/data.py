@@ -108,7 +108,7 @@ def generate(
 ) -> None:
     """Make the data of a scene with the SPH solver, e.g. to train on or to try the rest of `cconv` with.
 
-    Finished simulations are kept in DIR.unfinished until all are done: after a kill, the same command goes on from there.
+    Finished simulations wait in DIR.unfinished until all are done: after a kill, the same command goes on from there.
     """
     from cconv.data.generate import generate as run
     from cconv.scenes import scene_named
@@ -175,6 +175,94 @@ def convert(
 
     run(_open(path, mass, particle_spacing, frame_dt, force), out, overwrite, show_progress)
     results.print(f"{path} as LagrangeBench HDF5: {out}")
+
+
+@app.command()
+def show(
+    path: DataFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Picture to write; the data folder's name.png here if not given."),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Split of the trajectory: train, valid or test.")] = "test",
+    trajectory: Annotated[int, typer.Option(help="Number of the trajectory in its split, from 0.")] = 0,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="K,K,...", help="Frames of the picture, from 0, e.g. 0,50,100; four evenly spaced else."),
+    ] = None,
+    color: Annotated[
+        str,
+        typer.Option(
+            metavar="speed|density|type",
+            help="What colours show: speed; deviation of the SPH density from rest in percent (negative at a free "
+            "surface and beside thin walls, where particles are missing in the sum); or particle type.",
+        ),
+    ] = "speed",
+    animate: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.gif|FILE.mp4", help="Animation to write, 20 frames a second; MP4 needs ffmpeg."),
+    ] = None,
+    every: Annotated[
+        int, typer.Option(metavar="N", help="Animation and VTK files take every N-th frame of the trajectory.")
+    ] = 1,
+    vtk: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of VTK files to write; in ParaView open the .vtu.series in it and choose Point Gaussian.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace older VTK files in the folder.")] = False,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+) -> None:
+    """Draw frames of a trajectory side by side as PNG; animate them; export them for ParaView.
+
+    All frames of a file share one scale of colours; outliers are beyond its pointed ends.
+    """
+    from cconv.data.vtk import write_vtk
+    from cconv.report import particles
+
+    picture = Path(f"{path.resolve().name}.png") if out is None else out
+    particles.check_picture_name(picture)
+    if animate is not None:
+        particles.animation_writer(animate)
+    if every < 1:
+        raise ConfigError(f"`--every` must be at least 1, got {every}.")
+    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    shown = dataset.trajectory(split, trajectory)
+    chosen = evenly_spaced(len(shown), 4) if frames is None else parse_frames(frames)
+    figure = particles.frames_chart(shown, dataset.scene, chosen, color, show_progress)
+    sequence = range(0, len(shown), every)
+    if vtk is not None:
+        series = write_vtk(vtk, shown, dataset.scene, sequence, overwrite, show_progress)
+        results.print(f"{len(sequence)} frames for ParaView: {series}")
+    if animate is not None:
+        particles.write_animation(animate, shown, dataset.scene, sequence, color, show_progress)
+        results.print(f"Animation of {len(sequence)} frames: {animate}")
+    particles.write_picture(figure, picture)
+    results.print(f"Picture of {len(chosen)} frames: {picture}")
+
+
+def evenly_spaced(num_frames: int, count: int) -> list[int]:
+    """Up to `count` different frames from the first to the last."""
+    return sorted({round(k * (num_frames - 1) / (count - 1)) for k in range(count)})
+
+
+def parse_frames(text: str) -> list[int]:
+    """Frame numbers separated by commas.
+
+    Raises:
+        ConfigError: If one is not a whole number.
+    """
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(
+            f"`--frames` must be whole numbers separated by commas, such as 0,50,100, got {text!r}."
+        ) from error
 
 
 def parse_vector(text: str) -> tuple[float, ...]:

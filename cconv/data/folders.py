@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 import os
 import shutil
@@ -7,6 +7,24 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cconv.errors import ConfigError
+
+
+@contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """A temporary name beside `file` with its suffix, renamed to it when all is written, removed if anything fails.
+
+    Raises:
+        ConfigError: If the file cannot be written.
+    """
+    partial = file.with_name(f".{file.stem}.{os.getpid()}.partial{file.suffix}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        partial.replace(file)
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written ({error.strerror or error}); name another file.") from error
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Data sets of scenes, computed by the solver, in the LagrangeBench layout with our extra members.
 
-Finished trajectories wait in a folder beside the one to write until all are there, so that a run that was killed goes on
-where it stopped.
+Finished trajectories wait in a folder beside the one to write until all are there, so that a run that was killed goes
+on where it stopped.
 """
 
 import json
@@ -198,8 +198,8 @@ def _open_unfinished(unfinished: Path, request: dict, overwrite: bool) -> None:
     if unfinished.exists() and _read(note) != request:
         if not overwrite:
             raise ConfigError(
-                f"{unfinished}: holds the unfinished trajectories of another scene, seed or settings; finish that data set "
-                "with its own command, delete the folder, or overwrite it."
+                f"{unfinished}: holds the unfinished trajectories of another scene, seed or settings; finish that data "
+                "set with its own command, delete the folder, or overwrite it."
             )
         shutil.rmtree(unfinished)
     unfinished.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """What a reader returns: a scene, its trajectories, their frames."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from cconv.domain import Box
+from cconv.errors import ConfigError
 
 
 class ParticleType(IntEnum):
@@ -119,6 +120,18 @@ class Trajectory:
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
+
+    def time(self, index: int, frame_dt: float) -> float:
+        """Time of a frame since the start of the stored trajectory."""
+        return (self.first_frame + index) * frame_dt
+
+
+def check_frames(trajectory: Trajectory, frames: Iterable[int]) -> None:
+    """Raise `ConfigError` unless there is at least one frame and all are frames of the trajectory, counted from 0."""
+    frames, last = list(frames), len(trajectory) - 1
+    outside = [index for index in frames if not 0 <= index <= last]
+    if outside or not frames:
+        raise ConfigError(f"`frames` must be numbers from 0 to {last}, got {outside[0] if outside else 'none'}.")
 
 
 def finite_difference_velocities(positions: Tensor, frame_dt: float, box: Box) -> Tensor:

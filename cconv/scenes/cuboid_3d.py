@@ -1,7 +1,7 @@
 """Random bodies of fluid fall into a closed box, 3D: the kind of scene that the thesis and its data sets use.
 
-Source: the bachelor's thesis, section 3; Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR
-2020), whose data generator draws bodies, poses, velocities and viscosity as here.
+Source: the bachelor's thesis, section 3; Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions"
+(ICLR 2020), whose data generator draws bodies, poses, velocities and viscosity as here.
 """
 
 import math
@@ -18,7 +18,7 @@ from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_
 
 @dataclass(frozen=True, kw_only=True)
 class Cuboid3D(SimulatedScene):
-    """One to three bodies (blocks, balls, cylinders) with random pose, size and velocity; SI units, water, gravity in y.
+    """One to three bodies (blocks, balls, cylinders) with random pose, size and velocity; water in SI units.
 
     Data sets hold points on the walls with their normals instead of wall particles.
 

@@ -18,7 +18,7 @@ from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_
 class _LidDrivenCavity(SimulatedScene):
     """Reynolds number 100. One long run, cut in time once the flow is developed.
 
-    The lid spans the whole box, which is periodic along it: as its particles slide out at one end they enter at the other.
+    The lid spans the whole box, which is periodic along it: particles that slide out at one end enter at the other.
     """
 
     viscosity: float = 0.01

@@ -1,7 +1,7 @@
 """Random states in which particles are evenly spread but stand on no lattice.
 
-As LagrangeBench prepares its initial states: particles start near a lattice and are moved by the transport velocity until
-they have spread.
+As LagrangeBench prepares its initial states: particles start near a lattice and are moved by the transport velocity
+until they have spread.
 """
 
 import torch

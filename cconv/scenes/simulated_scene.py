@@ -114,7 +114,7 @@ class SimulatedScene(ABC):
 
     @property
     def boundary(self) -> tuple[Tensor, Tensor] | None:
-        """Points on the walls and their normals into the fluid (B, D), where data sets hold them instead of particles."""
+        """Points on the walls and normals into the fluid (B, D), where data sets hold them instead of particles."""
         return None
 
     @property

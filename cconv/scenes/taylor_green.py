@@ -1,7 +1,7 @@
 """Decaying Taylor-Green vortices in a periodic box, 2D and 3D.
 
-Source: Taylor and Green (1937), https://doi.org/10.1098/rspa.1937.0036; settings of LagrangeBench (Toshev et al., 2023),
-2D_TGV_2500_10kevery100 and 3D_TGV_8000_10kevery100.
+Source: Taylor and Green (1937), https://doi.org/10.1098/rspa.1937.0036; settings of LagrangeBench (Toshev et al.,
+2023), 2D_TGV_2500_10kevery100 and 3D_TGV_8000_10kevery100.
 """
 
 import math

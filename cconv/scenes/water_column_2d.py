@@ -1,6 +1,6 @@
 """Water at rest under gravity in an open box, 2D: what a solver or network must leave as it is.
 
-Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), section 4.1, has the same test.
+Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), section 4.1.
 """
 
 import math

@@ -197,8 +197,8 @@ def accelerations(
 ):  # fmt: skip
     """Set accelerations of fluid particles by pressure and viscosity, and those by the transport pressure.
 
-    Adami et al. 2013, eqs. 8 and 13, with the artificial viscosity of Adami et al. 2012, eq. 9, between fluid particles:
-    `artificial` is α h c, `core` 0.01 h². Without `wall_friction` walls slip freely.
+    Adami et al. 2013, eqs. 8 and 13, with the artificial viscosity of Adami et al. 2012, eq. 9, between fluid
+    particles: `artificial` is α h c, `core` 0.01 h². Without `wall_friction` walls slip freely.
     """
     scale = len(slopes) / support
     for i in range(first, last):

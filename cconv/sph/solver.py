@@ -6,12 +6,12 @@ r"""Weakly compressible SPH: the equations of motion of particles, integrated st
     p = \frac{\rho_0 c^2}{\gamma} \left( \left( \frac{\rho}{\rho_0} \right)^\gamma - 1 \right) + p_b
 
 (Neural SPH, eqs. 1 to 3). Particles are moved by a transport velocity that a constant pressure keeps apart from the
-momentum velocity, so that they stay evenly spread; walls are particles whose pressure and velocity are extrapolated from
-the fluid.
+momentum velocity, so that they stay evenly spread; walls are particles whose pressure and velocity are extrapolated
+from the fluid.
 
 Sources: Adami, Hu, Adams, "A generalized wall boundary condition for smoothed particle hydrodynamics", J. Comput. Phys.
-231 (2012); Adami, Hu, Adams, "A transport-velocity formulation for smoothed particle hydrodynamics", J. Comput. Phys. 241
-(2013); Toshev et al., "JAX-SPH" (2024), for the integrator and its settings.
+231 (2012); Adami, Hu, Adams, "A transport-velocity formulation for smoothed particle hydrodynamics", J. Comput. Phys.
+241 (2013); Toshev et al., "JAX-SPH" (2024), for the integrator and its settings.
 """
 
 import math
@@ -125,8 +125,8 @@ def check_time_step(
     limit = CFL * scales[condition]
     if not 0 < time_step <= limit * (1 + 1e-9):
         raise ConfigError(
-            f"`time_step` must be positive and at most {limit:.4g}, the limit set by {condition}, got {time_step:g}; take "
-            "a smaller one, or none to have it chosen."
+            f"`time_step` must be positive and at most {limit:.4g}, the limit set by {condition}, got {time_step:g}; "
+            "take a smaller one, or none to have it chosen."
         )
 
 
@@ -149,8 +149,8 @@ class WeaklyCompressibleSPH:
         equation_of_state: Pressure of the fluid.
         density: "summation" (D1; fluids without a free surface) or "evolution" (continuity equation).
         renormalize_every: Steps between renormalisations of evolved densities by a Shepard filter; 0 for none.
-        transport_pressure: Pressure that spreads the particles evenly; 0 for particles that move with the fluid. Only for
-            fluids without a free surface, where c² ρ_0 is usual.
+        transport_pressure: Pressure that spreads the particles evenly; 0 for particles that move with the fluid. Only
+            for fluids without a free surface, where c² ρ_0 is usual.
         artificial_viscosity: α of the artificial viscosity between fluid particles.
         wall_friction: Whether walls hold the fluid (no slip) or let it slip freely.
         force: External acceleration (N, D) at positions (N, D), or None.
@@ -248,7 +248,7 @@ class WeaklyCompressibleSPH:
         )
 
     def _accelerations(self, now: "_Arrays") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Accelerations (N, 3) and those of the transport velocity, zero for walls; densities (N,), those of walls too."""
+        """Accelerations (N, 3) and those of the transport velocity, zero for walls; densities (N,) of all."""
         table, slopes = self._tables
         support, eos, rows = self._kernel.support_radius, self.equation_of_state, self._neighbors.rows(now)
         force = np.zeros_like(now.positions)
@@ -393,8 +393,8 @@ def _check_apart(positions: Tensor, box: Box, particle_spacing: float) -> None:
     if len(edges):
         first, second = int(edges.receivers[0]), int(edges.senders[0])
         raise ConfigError(
-            f"`positions` must keep particles a tenth of the particle spacing apart, got particles {first} and {second} "
-            f"at a distance of {float(edges.distances[0]):.3g}; move or remove one."
+            f"`positions` must keep particles a tenth of the particle spacing apart, got particles {first} and "
+            f"{second} at a distance of {float(edges.distances[0]):.3g}; move or remove one."
         )
 
 
@@ -404,6 +404,6 @@ def _check_whole(positions: np.ndarray, box: Box, steps: int) -> None:
         inside &= (positions[:, axis] >= box.lower[axis]) & (positions[:, axis] <= box.upper[axis])
     if not inside.all():
         raise SimulationError(
-            f"The simulation blew up at step {steps}: {int((~inside).sum())} particles are no longer in the box; take a "
-            "smaller time step or a larger speed of sound."
+            f"The simulation blew up at step {steps}: {int((~inside).sum())} particles are no longer in the box; take "
+            "a smaller time step or a larger speed of sound."
         )

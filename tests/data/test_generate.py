@@ -166,9 +166,10 @@ def test_unfinished_trajectories_of_other_settings_are_not_mixed_in(tmp_path, mo
     def stop(*_):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(module, "_splits", stop)
-        made(tmp_path / "a", seed=1)
+        with pytest.raises(KeyboardInterrupt):
+            made(tmp_path / "a", seed=1)
     with pytest.raises(ConfigError, match="a.unfinished: holds the unfinished trajectories of another"):
         made(tmp_path / "a", seed=2)
     made(tmp_path / "a", seed=2, overwrite=True)

@@ -9,7 +9,6 @@ from cconv.errors import ConfigError
 from cconv.scenes import SCENES, scene_named
 from cconv.scenes.relaxed import glass, relaxed
 from cconv.scenes.walls import Walls, lattice, walls_around
-from cconv.sph import QuinticSpline
 
 PUBLISHED = {  # LagrangeBench: fluid, stored walls, moving among them, dx, dt, viscosity, lengths of the box
     "taylor_green_2d": (2500, 0, 0, 0.02, 4e-4, 0.01, (1, 1)),

@@ -1,0 +1,37 @@
+"""What a frame's particles can be coloured by or exported with."""
+
+import torch
+from torch import Tensor
+
+from cconv.data.trajectory import Frame, Scene
+from cconv.neighbors import radius_graph
+from cconv.sph.kernels import QuinticSpline
+from cconv.sph.operators import density
+
+
+def speed(frame: Frame) -> Tensor:
+    """Length of each particle's velocity (N,), length per time."""
+    return torch.linalg.vector_norm(frame.velocities, dim=1)
+
+
+def density_deviation(frame: Frame, scene: Scene) -> Tensor:
+    r"""How far each particle's density is from rest, :math:`\rho_i / \rho_0 - 1`, with :math:`\rho_0 = m_i / dx^D`.
+
+    ρ is the sum D1 over all particles, wall particles included, with a quintic spline of smoothing length dx: a lattice
+    of spacing dx deviates by less than 1e-4. Boundary points have no mass and count as empty space, as does what lies
+    beyond a free surface.
+
+    Args:
+        frame: Particles at one time.
+        scene: Spacing and box of the particles.
+
+    Returns:
+        Deviations (N,), float64, without unit.
+
+    Raises:
+        ConfigError: If the kernel's support, 3 dx, exceeds half of a periodic axis.
+    """
+    kernel = QuinticSpline(scene.particle_spacing, scene.dim)
+    masses = frame.masses.double()
+    edges = radius_graph(frame.positions.double(), kernel.support_radius, scene.box)
+    return density(masses, edges, kernel) * scene.particle_spacing**scene.dim / masses - 1
