@@ -1,13 +1,13 @@
-# make study   environment, embedded data, the quick study, report
+# make study   environment, data, the quick study, report
 # make test    environment, whole test suite
 # make check   environment, lint and format
-# make data    environment, embedded data only
+# make data    environment and the data of the quick study, made by the SPH solver
 
 PYTHON ?= python3.11
 VENV := .venv
 STUDY ?= experiments/quick.toml
 RUN ?= runs/$(basename $(notdir $(STUDY)))
-DATA := runs/data/taylor_green_2d
+DATA := runs/data/dam_break_2d
 
 .PHONY: study test check data clean
 
@@ -24,7 +24,7 @@ check: $(VENV)/.installed
 data: $(DATA)/metadata.json
 
 $(DATA)/metadata.json: $(VENV)/.installed
-	$(VENV)/bin/cconv data generate taylor_green_2d --out $(DATA) --trajectories 20 --frames 12 --overwrite
+	$(VENV)/bin/cconv data generate dam_break_2d --size small --out $(DATA) --overwrite
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)

@@ -47,7 +47,8 @@ def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterato
         yield partial
         _replace(folder, partial)
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written ({error.strerror or error}); name another folder.") from error
+        reason = " ".join(str(error.strerror or error).split())  # HDF5 tells in several lines
+        raise ConfigError(f"{folder}: cannot be written ({reason}); name another folder.") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

@@ -4,6 +4,8 @@ Finished trajectories wait in a folder beside the one to write until all are the
 on where it stopped.
 """
 
+import fcntl
+import hashlib
 import json
 import multiprocessing
 import os
@@ -12,14 +14,17 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from cconv import scenes, sph
 from cconv.data.folders import check_free
 from cconv.data.hdf5 import FILES, write_dataset
 from cconv.data.metadata import OWN_KEY
@@ -27,12 +32,12 @@ from cconv.data.simulate import Simulation, simulate
 from cconv.data.source import SPLITS, STORED
 from cconv.data.splits import share_out, split_in_time
 from cconv.data.trajectory import Boundary, Scene, Trajectory
-from cconv.errors import ConfigError
+from cconv.errors import ConfigError, DataError
 from cconv.scenes.simulated_scene import SimulatedScene
 
 Progress = Callable[[Iterable, str], Iterable]
 SPLIT_FRACTIONS = (0.5, 0.25, 0.25)  # as LagrangeBench
-_REQUEST = "request.json"
+_REQUEST, _LOCK, _SUFFIX, _PARTIAL = "request.json", "lock", ".safetensors", ".partial"
 
 
 class Generated(NamedTuple):
@@ -60,8 +65,9 @@ def generate(
 ) -> Generated:
     """Write trajectories of a scene, split 2:1:1 into train, valid and test files; a single one is cut in time.
 
-    The same scene, seed and numbers give the same bytes, however many workers. A run that is killed leaves what it
-    finished in ``FOLDER.unfinished``; the same call goes on from there, also with another number of trajectories.
+    The same scene, seed and numbers give the same bytes, however many workers. A run that is killed leaves the
+    trajectories that it finished in ``FOLDER.unfinished``; the same call goes on from there, also with another number
+    of them. In a script, several workers need the call to stand under ``if __name__ == "__main__":``.
 
     Args:
         scene: What to compute.
@@ -75,28 +81,30 @@ def generate(
 
     Raises:
         ConfigError: If a setting cannot be, or the folder exists and must not be replaced.
+        DataError: If a trajectory cannot be written.
         SimulationError: If trajectories blow up again and again.
     """
     folder = Path(folder).absolute()
     count = scene.num_trajectories if num_trajectories is None else num_trajectories
     frames = scene.num_frames if num_frames is None else num_frames
-    _check_numbers(count, frames)
+    _check_numbers(count, frames, workers)
     check_free(folder, FILES, overwrite)
     unfinished = folder.with_name(f"{folder.name}.unfinished")
-    request = {"scene": scene.name, **asdict(scene), "num_trajectories": None, "num_frames": frames, "seed": seed}
-    _open_unfinished(unfinished, json.loads(json.dumps(request)), overwrite)
-    files = [unfinished / f"{index:05d}.safetensors" for index in range(count)]
-    calls = [(scene, frames, seed, index, file) for index, file in enumerate(files) if not file.exists()]
-    workers = max(1, min(workers or len(os.sched_getaffinity(0)), len(calls)))
-    for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
-        pass
-    write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), overwrite)
-    failures = tuple(line for file in files for line in _load(file).failures)
-    shutil.rmtree(unfinished)
+    with _unfinished_folder(unfinished, _request(scene, frames, seed), overwrite):
+        files = [unfinished / f"{index:05d}{_SUFFIX}" for index in range(count)]
+        calls = [(scene, frames, seed, index, file) for index, file in enumerate(files) if not _is_whole(file)]
+        workers = max(1, min(workers or len(os.sched_getaffinity(0)), len(calls)))
+        for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
+            pass
+        write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), overwrite)
+        failures = tuple(line for file in files for line in _facts(file)["failures"])
+        shutil.rmtree(unfinished)
     return Generated(count - len(calls), failures)
 
 
-def _check_numbers(num_trajectories: int, num_frames: int) -> None:
+def _check_numbers(num_trajectories: int, num_frames: int, workers: int | None) -> None:
+    if workers is not None and workers < 1:
+        raise ConfigError(f"`workers` must be at least 1, got {workers}.")
     if num_trajectories < 1 or num_trajectories == 2:
         raise ConfigError(
             f"`num_trajectories` must be at least {len(SPLITS)}, one a split, or 1, which is cut in time, "
@@ -132,9 +140,15 @@ class _Frames:
             futures = [pool.submit(_compute_in_worker, *call) for call in self._calls]
             try:
                 yield from _counted(futures, counter)
-            finally:
+            except BrokenProcessPool as error:
+                raise DataError(
+                    "A worker process was ended from outside, perhaps for want of memory; take fewer workers and give "
+                    'the same command again. In a script, call `generate` under `if __name__ == "__main__":`.'
+                ) from error
+            except BaseException:
                 stop.set()
                 pool.shutdown(cancel_futures=True)
+                raise
 
 
 def _counted(futures: list[Future], counter) -> Iterator[None]:
@@ -149,18 +163,20 @@ def _counted(futures: list[Future], counter) -> Iterator[None]:
             yield
 
 
-_progress: dict = {}  # what the parent of a worker process listens to
+_progress: dict = {}  # of a worker process: the counter that its parent listens to
 
 
 def _start_worker(counter, stop, threads: int) -> None:
-    _progress.update(counter=counter, stop=stop)
+    _progress["counter"] = counter
     torch.set_num_threads(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_when_told, args=(stop,), daemon=True).start()
 
 
-def _end_with_parent() -> None:
-    multiprocessing.parent_process().join()
+def _end_when_told(stop) -> None:
+    """End this process, whatever it computes, when the parent says so or is gone."""
+    while not stop.wait(0.2) and multiprocessing.parent_process().is_alive():
+        pass
     os._exit(1)
 
 
@@ -168,42 +184,89 @@ def _compute_in_worker(*call) -> None:
     for _ in _compute(*call):
         with _progress["counter"].get_lock():
             _progress["counter"].value += 1
-        if _progress["stop"].is_set():
-            return
 
 
 def _compute(scene: SimulatedScene, num_frames: int, seed: int, index: int, file: Path) -> Iterator[None]:
     """Compute a trajectory and save it, whole or not at all."""
     simulation = yield from simulate(scene, num_frames, seed, index)
-    partial = file.with_suffix(".partial")
+    partial = file.with_suffix(_PARTIAL)
     try:
         tensors = {name: value for name, value in vars(simulation).items() if isinstance(value, torch.Tensor)}
         facts = {"viscosity": simulation.viscosity, "failures": simulation.failures}
         save_file(tensors, partial, metadata={"facts": json.dumps(facts)})
         partial.rename(file)
+    except (OSError, SafetensorError) as error:
+        raise DataError(
+            f"{file}: cannot be written ({error}); free some space and give the same command again, which keeps what "
+            "is finished."
+        ) from error
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _load(file: Path) -> Simulation:
+def _facts(file: Path) -> dict:
+    """What is stored beside the tensors: viscosity and failures."""
     with safe_open(file, framework="pt") as stored:
-        facts = json.loads(stored.metadata()["facts"])
+        return json.loads(stored.metadata()["facts"])
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether an earlier run finished the trajectory; a file that a crash of the machine cut short is none."""
+    try:
+        return bool(_facts(file))
+    except (OSError, SafetensorError):
+        return False
+
+
+def _load(file: Path) -> Simulation:
+    facts = _facts(file)
+    with safe_open(file, framework="pt") as stored:
         tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 - not a dict
     return Simulation(**tensors, viscosity=facts["viscosity"], failures=tuple(facts["failures"]))
 
 
-def _open_unfinished(unfinished: Path, request: dict, overwrite: bool) -> None:
-    """Make the folder of finished trajectories, or check that an older one holds what is asked for."""
-    note = unfinished / _REQUEST
-    if unfinished.exists() and _read(note) != request:
+def _request(scene: SimulatedScene, num_frames: int, seed: int) -> dict:
+    """What trajectories depend on, but for their number: settings, seed and the code that computes them."""
+    settings = {"scene": scene.name, **asdict(scene), "num_trajectories": None, "num_frames": num_frames, "seed": seed}
+    modules = sorted(file for folder in (sph, scenes) for file in Path(folder.__file__).parent.glob("*.py"))
+    code = hashlib.sha256(b"".join(file.read_bytes() for file in modules)).hexdigest()
+    return json.loads(json.dumps({**settings, "code": code}))
+
+
+@contextmanager
+def _unfinished_folder(unfinished: Path, request: dict, overwrite: bool) -> Iterator[None]:
+    """The folder of finished trajectories, new or as an earlier run of the same request left it, for this process only.
+
+    Raises:
+        ConfigError: If it cannot be used.
+    """
+    try:
+        unfinished.mkdir(parents=True, exist_ok=True)
+        with (unfinished / _LOCK).open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however that ends
+            _prepare(unfinished, request, overwrite)
+            yield
+    except BlockingIOError as error:
+        raise ConfigError(f"{unfinished}: another process works on it; wait for it or name another folder.") from error
+    except OSError as error:
+        raise ConfigError(f"{unfinished}: cannot be used ({error.strerror or error}); name another folder.") from error
+
+
+def _prepare(unfinished: Path, request: dict, overwrite: bool) -> None:
+    """Keep what belongs to the request; delete what belongs to another only if it may be overwritten."""
+    files = [file for file in unfinished.iterdir() if file.name != _LOCK]
+    if files and _read(unfinished / _REQUEST) != request:
+        others = [file.name for file in files if file.name != _REQUEST and file.suffix not in (_SUFFIX, _PARTIAL)]
+        if others:
+            raise ConfigError(f"{unfinished}: holds other things ({others[0]}); move them or name another folder.")
         if not overwrite:
             raise ConfigError(
-                f"{unfinished}: holds the unfinished trajectories of another scene, seed or settings; finish that data "
-                "set with its own command, delete the folder, or overwrite it."
+                f"{unfinished}: holds the unfinished trajectories of another scene, seed, settings or version; finish "
+                "that data set with its own command, delete the folder, or overwrite it."
             )
-        shutil.rmtree(unfinished)
-    unfinished.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps(request, indent=1) + "\n", encoding="utf-8")
+        for file in files:
+            file.unlink()
+    (unfinished / _REQUEST).write_text(json.dumps(request, indent=1) + "\n", encoding="utf-8")
 
 
 def _read(note: Path) -> object:

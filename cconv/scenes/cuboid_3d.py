@@ -50,8 +50,8 @@ class Cuboid3D(SimulatedScene):
         "small": {
             "particle_spacing": 0.1,
             "side": 1.2,
-            "steps_per_frame": 25,
-            "num_frames": 31,
+            "steps_per_frame": 50,
+            "num_frames": 41,
             "num_trajectories": 6,
             "relaxation_steps": 200,
         },

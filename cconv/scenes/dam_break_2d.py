@@ -46,8 +46,7 @@ class DamBreak2D(SimulatedScene):
         "small": {
             "particle_spacing": 0.05,
             "time_step": 7e-4,
-            "steps_per_frame": 50,
-            "num_frames": 61,
+            "num_frames": 31,
             "num_trajectories": 8,
             "relaxation_steps": 300,
             "column": (1.0, 1.0),

@@ -1,6 +1,6 @@
 """A round drop that a straining flow turns into an ellipse, 2D, without walls or forces.
 
-Source: Monaghan, "Simulating free surface flows with SPH", J. Comput. Phys. 110 (1994), section 5: the drop stays an
+Source: Monaghan, "Simulating free surface flows with SPH", J. Comput. Phys. 110 (1994): the drop stays an
 ellipse of constant area whose half axes follow an ordinary differential equation.
 """
 
@@ -27,7 +27,7 @@ class FreeDrop2D(SimulatedScene):
     name = "free_drop_2d"
     case = "DROP"
     dim = 2
-    source = "Monaghan (1994), section 5"
+    source = "Monaghan (1994)"
     reference_speed = 1.0
     density_scheme = "evolution"
     artificial_viscosity = 0.05

@@ -1,6 +1,6 @@
 """Water at rest under gravity in an open box, 2D: what a solver or network must leave as it is.
 
-Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), section 4.1.
+Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), have the test.
 """
 
 import math
@@ -26,7 +26,7 @@ class WaterColumn2D(SimulatedScene):
     name = "water_column_2d"
     case = "CW"
     dim = 2
-    source = "Adami, Hu, Adams (2012), section 4.1"
+    source = "Adami, Hu, Adams (2012)"
     reference_speed = math.sqrt(2)
     density_scheme = "evolution"
     artificial_viscosity = 0.1

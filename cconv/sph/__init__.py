@@ -1,4 +1,4 @@
-"""Analytic smoothed particle hydrodynamics: smoothing kernels, and the sums that networks learn."""
+"""Smoothed particle hydrodynamics: smoothing kernels, the sums that networks learn, and a solver."""
 
 from cconv.sph.kernels import (
     KERNELS,
@@ -11,15 +11,19 @@ from cconv.sph.kernels import (
     kernel_named,
 )
 from cconv.sph.operators import density, density_gradient, density_rate
+from cconv.sph.solver import EquationOfState, ParticleState, WeaklyCompressibleSPH
 
 __all__ = [
     "KERNELS",
     "CubicSpline",
+    "EquationOfState",
     "Gaussian",
+    "ParticleState",
     "Poly6",
     "QuinticSpline",
     "WendlandC2",
     "WendlandC4",
+    "WeaklyCompressibleSPH",
     "density",
     "density_gradient",
     "density_rate",

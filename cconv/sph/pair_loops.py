@@ -9,9 +9,15 @@ import math
 import numpy as np
 from numba import njit
 
-from cconv.sph.kernel_table import look_up
-
 _compile = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+
+
+@njit(inline="always", fastmath={"contract"}, error_model="numpy")
+def look_up(table, place):
+    """Value of a kernel's table at `place`, a distance counted in intervals, up to their number."""
+    interval = np.uintp(place)
+    t = place - interval
+    return ((table[interval, 0] * t + table[interval, 1]) * t + table[interval, 2]) * t + table[interval, 3]
 
 
 @njit(inline="always")
@@ -82,8 +88,8 @@ def move(positions, velocities, time_step, lower, lengths, moved):
 
 @_compile
 def sum_densities(first, last, splits, neighbors, positions, lengths, masses, support, table, is_wall, densities):
-    """Set the density of fluid particles to m_i Σ_j W_ij, themselves included (Adami et al. 2013, eq. 5)."""
-    scale = len(table) / support
+    """Set the density of fluid particles to m_i Σ_j W_ij, themselves included (Adami et al. 2013)."""
+    scale = (len(table) - 1) / support
     for i in range(first, last):
         if is_wall[i]:
             continue
@@ -104,8 +110,8 @@ def sum_densities(first, last, splits, neighbors, positions, lengths, masses, su
 def density_rates(
     first, last, splits, neighbors, positions, lengths, masses, support, slopes, is_wall, velocities, densities, rates
 ):
-    """Set the rate of density of fluid particles, ρ_i Σ_j m_j/ρ_j (u_i - u_j)·∇W_ij (Adami et al. 2012, eq. 3)."""
-    scale = len(slopes) / support
+    """Set the rate of density of fluid particles, ρ_i Σ_j m_j/ρ_j (u_i - u_j)·∇W_ij (Adami et al. 2012, eq. 6)."""
+    scale = (len(slopes) - 1) / support
     for i in range(first, last):
         if is_wall[i]:
             continue
@@ -129,8 +135,8 @@ def density_rates(
 def shepard_densities(
     first, last, splits, neighbors, positions, lengths, masses, support, table, is_wall, densities, renormalized
 ):
-    """Set Σ_j m_j W_ij / min(1, Σ_j m_j/ρ_j W_ij) for fluid particles (Zhang et al. 2017, section 2.4)."""
-    scale = len(table) / support
+    """Set Σ_j m_j W_ij / min(1, Σ_j m_j/ρ_j W_ij) for fluid particles (Zhang et al. 2017)."""
+    scale = (len(table) - 1) / support
     for i in range(first, last):
         if is_wall[i]:
             continue
@@ -158,7 +164,7 @@ def extrapolate_to_walls(
 
     A wall particle without fluid near it gets pressure 0 and its own velocity.
     """
-    scale = len(table) / support
+    scale = (len(table) - 1) / support
     for i in range(first, last):
         if not is_wall[i]:
             continue
@@ -197,10 +203,10 @@ def accelerations(
 ):  # fmt: skip
     """Set accelerations of fluid particles by pressure and viscosity, and those by the transport pressure.
 
-    Adami et al. 2013, eqs. 8 and 13, with the artificial viscosity of Adami et al. 2012, eq. 9, between fluid
+    Adami et al. 2013, eqs. 8 and 13, with the artificial viscosity of Adami et al. 2012, eq. 11, between fluid
     particles: `artificial` is α h c, `core` 0.01 h². Without `wall_friction` walls slip freely.
     """
-    scale = len(slopes) / support
+    scale = (len(slopes) - 1) / support
     for i in range(first, last):
         if is_wall[i]:
             continue

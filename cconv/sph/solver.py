@@ -11,7 +11,8 @@ from the fluid.
 
 Sources: Adami, Hu, Adams, "A generalized wall boundary condition for smoothed particle hydrodynamics", J. Comput. Phys.
 231 (2012); Adami, Hu, Adams, "A transport-velocity formulation for smoothed particle hydrodynamics", J. Comput. Phys.
-241 (2013); Toshev et al., "JAX-SPH" (2024), for the integrator and its settings.
+241 (2013); Zhang, Hu, Adams, "A weakly compressible SPH method based on a low-dissipation Riemann solver", J. Comput.
+Phys. 335 (2017), for the renormalisation; Toshev et al., "JAX-SPH" (2024), for the integrator and its settings.
 """
 
 import math
@@ -23,7 +24,7 @@ import torch
 from torch import Tensor
 
 from cconv.domain import Box
-from cconv.errors import ConfigError, SimulationError, check_choice, check_shape
+from cconv.errors import ConfigError, ShapeError, SimulationError, check_choice, check_shape
 from cconv.neighbors import half_list, radius_graph
 from cconv.ops.workers import run_on_workers
 from cconv.sph import pair_loops
@@ -98,7 +99,7 @@ class ParticleState:
 def largest_time_step(
     *, particle_spacing: float, sound_speed: float, reference_speed: float, viscosity: float = 0.0, force: float = 0.0
 ) -> float:
-    """Time step up to which sound, viscosity and force are resolved (Adami et al. 2012, eqs. 19 to 21).
+    """Time step up to which sound, viscosity and force are resolved (Adami et al. 2012).
 
     Args:
         particle_spacing: dx.
@@ -176,6 +177,11 @@ class WeaklyCompressibleSPH:
         skin: float = 0.3,
     ):
         check_choice("density", density, DENSITY_SCHEMES)
+        if kernel.dim != box.dim:
+            raise ConfigError(f"`kernel` must have the dimension of `box` ({box.dim}), got {kernel.dim}.")
+        if not skin >= 0:
+            raise ConfigError(f"`skin` must be at least 0, got {skin}.")
+        _check_wide_enough(box, kernel.support_radius + skin * particle_spacing)
         if density == "summation" and renormalize_every:
             raise ConfigError("`renormalize_every` must be 0 with summed densities: only evolved ones drift.")
         self.box, self.particle_spacing, self.equation_of_state = box, particle_spacing, equation_of_state
@@ -201,7 +207,7 @@ class WeaklyCompressibleSPH:
             is_wall: Which particles are walls (N,), bool.
 
         Raises:
-            ShapeError: If shapes do not fit.
+            ShapeError: If shapes or dtypes do not fit.
             ConfigError: If a particle lies outside the box, or two fluid particles overlap.
         """
         particles = len(positions)
@@ -209,17 +215,22 @@ class WeaklyCompressibleSPH:
         check_shape("velocities", velocities.shape, (particles, self.box.dim))
         for name, values in (("masses", masses), ("viscosities", viscosities), ("is_wall", is_wall)):
             check_shape(name, values.shape, (particles,))
-        positions = self.box.wrap(positions.double())
+        if particles == 0 or is_wall.dtype != torch.bool:
+            raise ShapeError(f"`is_wall` must be bool of at least one particle, got {particles} of {is_wall.dtype}.")
+        positions, velocities, masses, viscosities = (
+            values.detach().double().clone() for values in (positions, velocities, masses, viscosities)
+        )
+        positions = self.box.wrap(positions)
         _check_inside(positions, self.box)
         _check_apart(positions, self.box, self.particle_spacing)
         state = ParticleState(
             positions=positions,
-            velocities=velocities.double(),
-            transport_velocities=velocities.double(),
+            velocities=velocities,
+            transport_velocities=velocities.clone(),
             densities=torch.full((particles,), self.equation_of_state.rest_density, dtype=torch.float64),
-            masses=masses.double(),
-            viscosities=viscosities.double(),
-            is_wall=is_wall,
+            masses=masses,
+            viscosities=viscosities,
+            is_wall=is_wall.clone(),
         )
         if self._density == "evolution":
             return state
@@ -227,6 +238,8 @@ class WeaklyCompressibleSPH:
 
     def step(self, state: ParticleState, time_step: float) -> ParticleState:
         """State one semi-implicit Euler step later: velocities first, then positions, then densities.
+
+        The given state stays as it is. `check_time_step` says whether a time step is small enough.
 
         Raises:
             SimulationError: If a particle is no longer at a finite place, or left through an open side of the box.
@@ -326,7 +339,7 @@ def _padded(vectors: Tensor) -> np.ndarray:
 
 
 def _unpadded(vectors: np.ndarray, dim: int) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(vectors[:, :dim]))
+    return torch.from_numpy(vectors[:, :dim].copy())
 
 
 class _Rows:
@@ -352,20 +365,19 @@ class _NeighborList:
     def __init__(self, box: Box, reach: float, skin: float):
         self._box, self._reach, self._skin = box, reach, skin
         self._lengths = _periodic_lengths(box)
-        self._searched_at = np.empty((0, 3))
+        self._searched_at, self._walls_then = np.empty((0, 3)), np.empty(0, bool)
         self._found: _Rows | None = None
 
     def rows(self, now: _Arrays) -> _Rows:
         """Rows of all pairs with a fluid particle."""
-        before = self._searched_at
-        holds = before.shape == now.positions.shape and not pair_loops.moved_further(
-            now.positions, before, self._lengths, 0.5 * self._skin
+        holds = np.array_equal(now.is_wall, self._walls_then) and not pair_loops.moved_further(
+            now.positions, self._searched_at, self._lengths, 0.5 * self._skin
         )
         if not holds:
             positions = _unpadded(now.positions, self._box.dim)
             pairs = half_list(positions, self._reach + self._skin, self._box)
             self._found = _Rows(*pair_loops.rows_of_pairs(pairs, now.is_wall))
-            self._searched_at = now.positions
+            self._searched_at, self._walls_then = now.positions, now.is_wall.copy()
         return self._found
 
 
@@ -374,6 +386,15 @@ def _periodic_lengths(box: Box) -> np.ndarray:
     lengths = np.full(3, np.inf)
     lengths[: box.dim] = np.where(box.periodic, box.lengths, np.inf)
     return lengths
+
+
+def _check_wide_enough(box: Box, reach: float) -> None:
+    for axis, (length, periodic) in enumerate(zip(box.lengths, box.periodic, strict=True)):
+        if periodic and length < 2 * reach:
+            raise ConfigError(
+                f"`box` must be at least {2 * reach:.4g} long on its periodic axis {axis}, twice the reach of the "
+                f"kernel and the skin, got {length:g}; take a smaller particle spacing."
+            )
 
 
 def _check_inside(positions: Tensor, box: Box) -> None:

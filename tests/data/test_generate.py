@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from cconv.data import generate as module
 from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
 from cconv.data.simulate import simulate
-from cconv.errors import ConfigError, SimulationError
+from cconv.errors import ConfigError, DataError, SimulationError
 from cconv.scenes import SCENES, scene_named
 
 FILES = ("train.h5", "valid.h5", "test.h5", "metadata.json")
@@ -163,11 +164,8 @@ def test_finished_trajectories_are_not_computed_again(tmp_path, monkeypatch):
 
 
 def test_unfinished_trajectories_of_other_settings_are_not_mixed_in(tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr(module, "_splits", stop)
+        patched.setattr(module, "_splits", _interrupt)
         with pytest.raises(KeyboardInterrupt):
             made(tmp_path / "a", seed=1)
     with pytest.raises(ConfigError, match="a.unfinished: holds the unfinished trajectories of another"):
@@ -199,11 +197,91 @@ def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     assert not unfinished.exists()
 
 
+def test_a_full_disk_is_told_and_finished_trajectories_stay(tmp_path, monkeypatch):
+    real, written = module.save_file, []
+
+    def write_two(tensors, file, metadata):
+        if len(written) == 2:
+            file.write_bytes(b"half")
+            raise SafetensorError("I/O error: No space left on device (os error 28)")
+        written.append(file)
+        real(tensors, file, metadata)
+
+    monkeypatch.setattr(module, "save_file", write_two)
+    with pytest.raises(DataError, match="00002.safetensors: cannot be written .*No space left"):
+        made(tmp_path / "a")
+    kept = sorted(entry.name for entry in (tmp_path / "a.unfinished").iterdir())
+    assert kept == ["00000.safetensors", "00001.safetensors", "lock", "request.json"]
+    assert not (tmp_path / "a").exists()
+
+
+def test_files_that_were_cut_short_are_computed_again(tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "_splits", _interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            made(tmp_path / "a")
+    (tmp_path / "a.unfinished" / "00001.safetensors").write_bytes(b"")
+    _, done = made(tmp_path / "a")
+    assert done.reused == 3
+
+
+def test_foreign_files_beside_unfinished_trajectories_survive(tmp_path):
+    mine = tmp_path / "a.unfinished" / "thesis.tex"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    with pytest.raises(ConfigError, match="holds other things .thesis.tex"):
+        made(tmp_path / "a", overwrite=True)
+    assert mine.read_text() == "mine"
+
+
+def test_a_second_run_into_the_same_folder_is_refused(tmp_path, monkeypatch):
+    def again(*_):
+        with pytest.raises(ConfigError, match="another process works on it"):
+            made(tmp_path / "a")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_splits", again)
+    with pytest.raises(KeyboardInterrupt):
+        made(tmp_path / "a")
+
+
+def test_workers_end_with_their_parent_and_at_an_interrupt(tmp_path):
+    """Even within a relaxation that would take minutes."""
+    command = [
+        Path(sys.executable).parent / "cconv", "data", "generate", "taylor_green_2d", "--out", tmp_path / "a",
+        "--trajectories", "4", "--frames", "2000", "--workers", "2",
+    ]  # fmt: skip
+    for told in (signal.SIGINT, signal.SIGKILL):
+        running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60
+        while len(_children(running.pid)) < 3 and time.monotonic() < deadline:  # two workers, one resource tracker
+            time.sleep(0.05)
+        time.sleep(2)
+        children = _children(running.pid)
+        running.send_signal(told)
+        running.wait(timeout=20)
+        deadline = time.monotonic() + 20
+        while any(Path(f"/proc/{child}/cmdline").exists() for child in children) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert len(children) >= 2
+        assert not any(Path(f"/proc/{child}/cmdline").exists() for child in children)
+    assert not (tmp_path / "a").exists()
+
+
+def _children(pid):
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
+
+
 def test_numbers_that_cannot_be_are_refused(tmp_path):
     for settings, message in (
         ({"num_trajectories": 2}, "num_trajectories"),
         ({"num_trajectories": 0}, "num_trajectories"),
         ({"num_frames": 0}, "num_frames"),
+        ({"workers": 0}, "workers"),
         ({"num_trajectories": 1, "num_frames": 2}, "num_frames"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -115,9 +115,20 @@ def test_drop_follows_the_ellipse_of_monaghan():
 
 def test_cuboid_has_boundary_points_with_normals_into_the_box():
     points, normals = scene_named("cuboid_3d", "small").boundary
-    inside = points + 0.1 * normals
-    assert ((inside > 0) & (inside < 1.2)).all()
+    axes = normals.abs().argmax(dim=1)[:, None]
+    places = points.gather(1, axes)[:, 0]
+    expected = torch.where(normals.gather(1, axes)[:, 0] > 0, 0.0, 1.2).double()
+    torch.testing.assert_close(places, expected)
     assert torch.equal(normals.norm(dim=1), torch.ones(len(normals)).double())
+    assert ((points >= 0) & (points <= 1.2 + 1e-12)).all()
+
+
+def test_trajectories_of_the_cuboid_differ_in_viscosity():
+    scene = scene_named("cuboid_3d", "small")
+    drawn = [scene.draw_viscosity(torch.Generator().manual_seed(seed)) for seed in range(20)]
+    assert len(set(drawn)) == 20
+    assert 0.1 * scene.viscosity <= min(drawn) < 0.3 * scene.viscosity
+    assert 0.6 * scene.viscosity < max(drawn) <= scene.viscosity
 
 
 def test_settings_that_cannot_be_are_refused():
