@@ -61,6 +61,26 @@ class SearchConfig(StrictModel):
     concurrency: int | None = Field(None, ge=1)
 
 
+class ClosedFormConfig(StrictModel):
+    """Least squares for the single linear layers of the space; no stage of that kind without this table.
+
+    At most `max_candidates` layers are fitted to `screening_frames` frames, ranges sampled at `values_per_range`
+    places; the `count` best are fitted to all frames and become finalists.
+    """
+
+    count: int = Field(3, ge=1)
+    max_candidates: int = Field(200, ge=1)
+    screening_frames: int = Field(4, ge=1)
+    values_per_range: int = Field(3, ge=2)
+    ridge: float = Field(1e-10, ge=0)
+
+
+class SelectionConfig(StrictModel):
+    """When accurate is accurate enough: models below `accurate_enough` count as equal, and the cheapest wins."""
+
+    accurate_enough: float | None = Field(None, gt=0)
+
+
 class FinalistsConfig(StrictModel):
     """Retraining of the best configurations with fresh seeds. `updates` None means the search's budget."""
 
@@ -93,9 +113,11 @@ class StudyConfig(StrictModel):
     data: DataConfig = DataConfig()
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
+    closed_form: ClosedFormConfig | None = None
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
     cost: CostConfig = CostConfig()
+    selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""The whole study: random search, adaptive search, finalists, summary."""
+"""The whole study: closed forms, random search, adaptive search, finalists, summary."""
 
 import time
 from collections import Counter
@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 
 from cconv.data.dataset import Dataset
 from cconv.errors import ConfigError
-from cconv.evaluation.cost import flops_per_particle, measure_costs
+from cconv.evaluation.cost import measure_costs
+from cconv.study.closed_form import fit_closed_form_finalists, flops_of, screen_closed_forms
 from cconv.study.config import StudyConfig, TrainingConfig
 from cconv.study.environment import describe_environment
 from cconv.study.finalists import (
@@ -19,11 +20,11 @@ from cconv.study.finalists import (
     retrained_finalists,
 )
 from cconv.study.observer import Observer
-from cconv.study.problem import Problem, load_problem, open_study_data, study_samples
+from cconv.study.problem import load_problem, open_study_data, study_samples
 from cconv.study.records import OUTCOMES, RunFolder, TrialRecord
 from cconv.study.search import Session, adaptive_search, random_search, ray_session, run_jobs
 from cconv.study.selection import choose_finalists, pareto_front, recommend
-from cconv.study.space import SearchSpace, configure
+from cconv.study.space import SearchSpace
 from cconv.training.checkpoint import load_model
 
 Progress = Callable[[Iterable, str], Iterable]
@@ -62,7 +63,7 @@ def run_study(
         run.write("environment.json", describe_environment(study, dataset))
         problem = load_problem(study, dataset, progress)
         session = Session(study=study, space=space, problem=problem, run=run, observer=observer)
-        for stage in _stages(session):
+        for stage in _stages(session, progress):
             run.set_state("running", stage)
         stage = "summary"
         run.set_state("running", stage)
@@ -76,9 +77,13 @@ def run_study(
     return summary
 
 
-def _stages(session: Session) -> Iterable[str]:
+def _stages(session: Session, progress: Progress) -> Iterable[str]:
     """Run the trainings of a study; yields the name of each stage before it begins."""
     study, run = session.study, session.run
+    if study.closed_form is not None:
+        yield "closed_form"
+        screen_closed_forms(study, session.space, session.problem, run, progress)
+        fit_closed_form_finalists(study, session.problem, run, progress)
     with ray_session(session):
         yield "random"
         random_search(session)
@@ -99,15 +104,11 @@ def finalist_training(study: StudyConfig) -> TrainingConfig:
 def _challengers(session: Session) -> list[Finalist]:
     """The configurations that challenge the baseline; none where only the baseline reached the full budget."""
     baseline, records = session.space.baseline, session.run.trials()
-    completed = [record for record in records if record.outcome == "completed" and record.parameters != baseline]
-    cost = {record.id: _flops(record, session.study, session.problem) for record in completed}
+    trained = [record for record in records if not record.is_closed_form and record.parameters != baseline]
+    completed = [record for record in trained if record.outcome == "completed"]
+    cost = {record.id: flops_of(record, session.study, session.problem) for record in completed}
     chosen = choose_finalists(completed, cost, session.study.finalists.count)
     return [Finalist(id=record.id, parameters=record.parameters) for record in chosen]
-
-
-def _flops(record: TrialRecord, study: StudyConfig, problem: Problem) -> float:
-    network, _ = configure(record.parameters, study.network, study.training)
-    return flops_per_particle(problem.build_model(network, 0), problem.valid_samples[0].inputs)
 
 
 def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
@@ -130,6 +131,7 @@ def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
     chosen, reason = recommend(
         {finalist.id: finalist.valid_errors for finalist in finalists},
         {finalist.id: costs[finalist.id].ms_per_frame for finalist in finalists},
+        study.selection.accurate_enough,
     )
     frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
     retrainings = [record for records in run.retrainings().values() for record in records]

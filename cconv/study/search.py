@@ -107,7 +107,8 @@ def adaptive_search(session: Session) -> None:
 
     study, space = session.study, session.space
     journal = open_journal(session.run.path / "optuna.journal")
-    mirror_trials(session.run.trials(), space, study.training.updates, journal, study.name)
+    trained = [record for record in session.run.trials() if not record.is_closed_form]
+    mirror_trials(trained, space, study.training.updates, journal, study.name)
     sampler = RungAwareOptunaSearch(
         optuna_distributions(space),
         metric=METRIC,

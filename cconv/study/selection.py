@@ -43,35 +43,41 @@ def choose_finalists(records: Sequence[TrialRecord], cost: Mapping[str, float], 
     return [by_id[trial] for trial in sorted(front, key=errors.__getitem__)[:count]]
 
 
-def recommend(valid_errors: Mapping[str, Sequence[float]], cost: Mapping[str, float]) -> tuple[str, str]:
-    """The cheapest model whose validation error is within one standard error of the best, and why.
+def recommend(
+    valid_errors: Mapping[str, Sequence[float]], cost: Mapping[str, float], accurate_enough: float | None = None
+) -> tuple[str, str]:
+    """The cheapest model whose validation error is within one standard error of the best, or small enough, and why.
 
     Source: the one-standard-error rule of Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3,
     with the standard error over seeds.
 
     Args:
-        valid_errors: Validation error of each seed, by model.
+        valid_errors: Validation error of each seed, by model; a single one where no seed is drawn.
         cost: ms per frame, by model.
+        accurate_enough: Error below which models count as equally accurate; None for no such limit.
 
     Returns:
         Name of the model, and the reason in words.
     """
     means = {name: sum(values) / len(values) for name, values in valid_errors.items()}
     best = min(means, key=means.__getitem__)
-    margin = means[best] + _standard_error(valid_errors[best])
-    chosen = min((name for name in means if means[name] <= margin), key=cost.__getitem__)
+    within = means[best] + _standard_error(valid_errors[best])
+    limit = max(within, accurate_enough or 0.0)
+    chosen = min((name for name in means if means[name] <= limit), key=cost.__getitem__)
     if chosen == best:
         cheaper = [name for name in means if cost[name] < cost[best]]
         why = "none cheaper is as accurate" if cheaper else "it is also the cheapest"
         return best, f"{best} has the smallest validation error ({means[best]:.3g}), and {why}."
+    rule = "is within one standard error of the best" if limit == within else "is accurate enough for this study"
     return chosen, (
         f"{chosen} is the cheapest model ({cost[chosen]:.3g} ms per frame) whose validation error "
-        f"({means[chosen]:.3g}) is within one standard error of the best "
-        f"({best}: {means[best]:.3g}, limit {margin:.3g})."
+        f"({means[chosen]:.3g}) {rule} (limit {limit:.3g}; best is {best} with {means[best]:.3g})."
     )
 
 
 def _standard_error(values: Sequence[float]) -> float:
+    if len(values) == 1:
+        return 0.0
     mean = sum(values) / len(values)
     variance = sum((value - mean) ** 2 for value in values) / (len(values) - 1)
     return (variance / len(values)) ** 0.5

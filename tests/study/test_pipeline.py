@@ -34,10 +34,10 @@ def test_the_baseline_comes_first_in_both_searches(run):
 
 def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
     records = run.trials()
-    assert len(records) == 6
+    assert len(records) == 10
     assert all(record.outcome in ("completed", "stopped", "diverged") for record in records)
     counts = {stage: sum(outcomes.values()) for stage, outcomes in summary["trials"].items()}
-    assert counts == {"random": 3, "adaptive": 3, "finalists": 4}
+    assert counts == {"closed_form": 4, "random": 3, "adaptive": 3, "finalists": 5}
 
 
 def test_all_trials_share_data_seed_and_differ_in_nothing_else_than_parameters(run):

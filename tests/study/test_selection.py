@@ -40,6 +40,16 @@ def test_the_cheapest_within_one_standard_error_is_recommended():
     assert "cheapest" in reason
 
 
+def test_the_cheapest_that_is_accurate_enough_is_recommended():
+    errors = {"best": [1e-6], "small": [8e-4, 9e-4], "far": [2e-3, 2e-3]}
+    cost = {"best": 3.0, "small": 2.0, "far": 1.0}
+    assert recommend(errors, cost)[0] == "best"
+    chosen, reason = recommend(errors, cost, accurate_enough=1e-3)
+    assert chosen == "small"
+    assert "accurate enough for this study (limit 0.001" in reason
+    assert recommend(errors, cost, accurate_enough=1e-7)[0] == "best"
+
+
 def test_the_best_is_recommended_where_none_cheaper_is_as_accurate():
     chosen, reason = recommend({"best": [1.0, 1.0], "far": [2.0, 2.0]}, {"best": 10.0, "far": 1.0})
     assert chosen == "best"

@@ -1,0 +1,83 @@
+"""The closed-form stage: which layers are tried, and what becomes of the best."""
+
+import json
+
+import pytest
+
+from cconv import load_model, open_dataset
+from cconv.data.targets import iterate_samples
+from cconv.evaluation.metrics import frame_errors, normalized_mse
+from cconv.study.closed_form import STAGE, _draw, single_layers
+from cconv.study.records import RunFolder
+from cconv.study.space import SearchSpace, load_space
+from cconv.training.field_model import NetworkConfig
+
+
+def space_of(**parameters):
+    domains = {
+        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "test"}
+        for name, values in parameters.items()
+    }
+    return SearchSpace.model_validate({"name": "test", "description": "test", "parameters": domains})
+
+
+def test_every_combination_is_tried_once_and_what_has_no_effect_is_left_out():
+    space = space_of(
+        basis=["grid", "radial"], kernel_size=[2, 3, 4], radial_terms=[8, 16], window=["none", "poly6"], layers=[1, 4],
+        learning_rate=[1e-3, 1e-2],
+    )  # fmt: skip
+    layers = single_layers(space, NetworkConfig(), 3)
+    grid = [layer for layer in layers if layer["basis"] == "grid"]
+    radial = [layer for layer in layers if layer["basis"] == "radial"]
+    assert len(grid) == 3 * 2
+    assert len(radial) == 2 * 2
+    assert all(set(layer) == {"layers", "basis", "kernel_size", "window"} for layer in grid)
+    assert all(set(layer) == {"layers", "basis", "radial_terms", "window"} for layer in radial)
+    assert all(layer["layers"] == 1 for layer in layers)
+
+
+def test_ranges_are_sampled_with_both_ends():
+    space = load_space("search_spaces/density.toml")
+    layers = single_layers(space, NetworkConfig(), 3)
+    assert {layer["relative_cutoff"] for layer in layers} == {1.5, 2.0, 2.5}
+
+
+def test_a_draw_holds_as_many_of_each_basis():
+    layers = [{"basis": "grid", "kernel_size": size} for size in range(50)]
+    layers += [{"basis": "radial", "radial_terms": terms} for terms in range(5)]
+    drawn = _draw(layers, 20, seed=0)
+    assert len(drawn) == 20
+    assert sum(layer["basis"] == "radial" for layer in drawn) == 5
+    assert drawn == _draw(layers, 20, seed=0) != _draw(layers, 20, seed=1)
+    assert _draw(layers, 100, seed=0) == layers
+
+
+@pytest.fixture
+def run(finished_run):
+    return RunFolder.open(finished_run)
+
+
+def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
+    screened = [record for record in run.trials() if record.stage == STAGE]
+    best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
+    (record,) = run.retrainings()[best.id]
+    assert record.is_closed_form
+    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
+    model = load_model(run.path / entry["checkpoint"])
+    samples = list(iterate_samples(open_dataset(flow_folder), "test", "density_gradient", model.kernel))
+    assert entry["test"]["normalized_mse"] == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
+    assert list(entry["test"]["by_seed"]) == [record.id]
+    low, high = entry["test"]["ci95"]
+    assert low < entry["test"]["normalized_mse"] < high
+    card = json.loads((run.path / entry["checkpoint"] / "card.json").read_text())
+    assert card["closed_form"]
+    assert card["test"]["ci95"] == entry["test"]["ci95"]
+
+
+def test_optuna_is_told_of_trained_trials_only(run):
+    import optuna
+
+    from cconv.study.optuna_mirror import open_journal
+
+    study = optuna.load_study(study_name="smoke", storage=open_journal(run.path / "optuna.journal"))
+    assert len(study.trials) == 6
