@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder, *long]
 
     def ready():
-        return any(path.stat().st_size for path in folder.glob("trials/*/log.jsonl"))
+        return any(path.stat().st_size for path in folder.glob("trials/random_*/log.jsonl"))
 
     status, error = interrupt(command, ready)
     assert status == 130

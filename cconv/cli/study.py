@@ -41,11 +41,12 @@ def run(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
     settings: Settings = None,
 ) -> None:
-    """Run a whole study: random search, adaptive search, finalists, report.
+    """Run a whole study: closed forms, random search, adaptive search, finalists, report.
 
-    Trials run at once on all cores, one core each, and stop early by ASHA. The most accurate configurations and the
-    baseline are then retrained with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn.
-    Ctrl-C stops cleanly: what was recorded stays readable (`cconv study status`, `cconv report`).
+    Single linear layers are solved by least squares first, if the study file asks for it. Trials then run at once on
+    all cores, one core each, and stop early by ASHA. The most accurate configurations and the baseline are retrained
+    with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn. Ctrl-C stops cleanly: what was
+    recorded stays readable (`cconv study status`, `cconv report`).
     """
     from cconv.report.page import write_report
     from cconv.study.config import load_study
