@@ -117,7 +117,7 @@ def _finalists_table(summary: dict) -> Table:
     table = Table(
         title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left", padding=(0, 0)
     )
-    for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters"):
+    for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters", "stable"):
         table.add_column(name, justify="left" if name == "model" else "right", no_wrap=True)
     for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
         test, cost = entry["test"], entry["cost"]
@@ -129,5 +129,6 @@ def _finalists_table(summary: dict) -> Table:
             f"{low:.3g}–{high:.3g}",
             f"{cost['ms_per_frame']:.2f}",
             f"{entry['num_parameters']:,}",
+            "yes" if entry["stability"]["stable"] else "no",
         )
     return table

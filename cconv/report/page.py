@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
 from cconv.report.plots import best_so_far_chart, learning_curves_chart, speed_accuracy_chart
-from cconv.report.tables import curves_table, finalists_table, trials_table
+from cconv.report.tables import curves_table, finalists_table, stability_rows, trials_table
 from cconv.study.records import RunFolder
 
 
@@ -45,6 +45,7 @@ def render_report(run: RunFolder) -> str:
         curves_chart=_picture(learning_curves_chart(curves)) if searched else None,
         search_chart=_picture(best_so_far_chart(trials)) if searched else None,
         finalists=_finalists_rows(summary) if finished else [],
+        stability=stability_rows(summary) if finished else [],
         trials=_html(trials.sort_values("valid_normalized_mse")) if not trials.empty else "",
     )
 

@@ -61,8 +61,33 @@ def finalists_table(summary: Mapping) -> pd.DataFrame:
                 "peak_mb": entry["cost"]["peak_mb"],
                 "flops_per_particle": entry["cost"]["flops_per_particle"],
                 "num_parameters": entry["num_parameters"],
+                "stable": entry["stability"]["stable"] if entry["stability"] else None,
                 "train_seconds": entry["train_seconds"],
                 **entry["config"]["parameters"],
             }
         )
     return pd.DataFrame(rows).sort_values("normalized_mse", ignore_index=True)
+
+
+def stability_rows(summary: Mapping) -> list[tuple[str, list[str]]]:
+    """One row a check of stability, with a cell for each finalist; none for a run that measured no stability."""
+    checks = [entry["stability"] for entry in summary["finalists"]]
+    if not all(checks):
+        return []
+    first = checks[0]
+    rows = [("passes every check", ["yes" if check["stable"] else "no" for check in checks])]
+    for regime, values in first["regimes"].items():
+        label = f"regime {regime.replace('_', ' ')} ({100 * values['share']:.0f} % of the particles)"
+        rows.append((label, [f"{check['regimes'][regime]['normalized_mse']:.3g}" for check in checks]))
+    for frame in first["stress"]:
+        errors = [check["stress"][frame] for check in checks]
+        label = f"frame {frame.replace('_', ' ')}"
+        rows.append((label, ["–" if error is None else f"{error:.3g}" for error in errors]))
+    rows.append(("float32 from float64", [f"{check['precision']:.2g}" for check in checks]))
+    if first["density_rollout"]:
+        rollouts = [check["density_rollout"] for check in checks]
+        rows.append(("integrated density, deviation", [f"{rollout['largest']:.3g}" for rollout in rollouts]))
+        outside = [rollout["first_frame_outside"] for rollout in rollouts]
+        label = f"first frame outside, of {rollouts[0]['frames']}"
+        rows.append((label, ["never" if frame is None else str(frame) for frame in outside]))
+    return rows

@@ -119,7 +119,7 @@ def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per
     }
 
 
-def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, run: RunFolder) -> dict:
+def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder) -> dict:
     """A finalist's entry in summary.json."""
     config = finalist.records[0].config
     return {
@@ -129,7 +129,7 @@ def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, run: RunFolde
         "valid": {"normalized_mse": float(np.mean(finalist.valid_errors))},
         "test": dict(test),
         "cost": asdict(cost),
-        "stability": None,
+        "stability": dict(stability),
         "checkpoint": str(finalist.best_checkpoint.relative_to(run.path)),
         "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
     }

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from cconv.data.dataset import Dataset
 from cconv.errors import ConfigError
 from cconv.evaluation.cost import measure_costs
+from cconv.evaluation.stability import measure_stability
 from cconv.study.closed_form import fit_closed_form_finalists, flops_of, screen_closed_forms
 from cconv.study.config import StudyConfig, TrainingConfig
 from cconv.study.environment import describe_environment
@@ -125,6 +126,11 @@ def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
     inputs = [sample.inputs for sample in problem.valid_samples[:5]]
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     costs = measure_costs(checkpoints, load_model, inputs, threads=study.cost.threads, repeats=study.cost.repeats)
+    trajectories = list(dataset.trajectories("valid"))  # stability decides, and the test split must not
+    stability = {
+        finalist.id: measure_stability(load_model(finalist.best_checkpoint), trajectories, dataset.scene)
+        for finalist in progress(finalists, "stability")
+    }
     environment = run.read("environment.json")
     for finalist in finalists:
         complete_cards(finalist, tests[finalist.id], environment)
@@ -132,6 +138,7 @@ def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
         {finalist.id: finalist.valid_errors for finalist in finalists},
         {finalist.id: costs[finalist.id].ms_per_frame for finalist in finalists},
         study.selection.accurate_enough,
+        unstable=[finalist for finalist, checks in stability.items() if not checks["stable"]],
     )
     frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
     retrainings = [record for records in run.retrainings().values() for record in records]
@@ -140,7 +147,9 @@ def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
         "task": study.task,
         "dataset": {"path": str(dataset.path), "scene": dataset.scene.name, "frames": frames},
         "baseline": BASELINE,
-        "finalists": [finalist_entry(each, tests[each.id], costs[each.id], run) for each in finalists],
+        "finalists": [
+            finalist_entry(each, tests[each.id], costs[each.id], stability[each.id], run) for each in finalists
+        ],
         "failed_finalists": failed,
         "pareto_front": pareto_front(
             {each.id: (tests[each.id]["normalized_mse"], costs[each.id].ms_per_frame) for each in finalists}

@@ -1,6 +1,6 @@
 """Which models to look at closer, and which one to recommend: no more than the scene needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from cconv.study.records import TrialRecord
 
@@ -44,9 +44,12 @@ def choose_finalists(records: Sequence[TrialRecord], cost: Mapping[str, float], 
 
 
 def recommend(
-    valid_errors: Mapping[str, Sequence[float]], cost: Mapping[str, float], accurate_enough: float | None = None
+    valid_errors: Mapping[str, Sequence[float]],
+    cost: Mapping[str, float],
+    accurate_enough: float | None = None,
+    unstable: Collection[str] = (),
 ) -> tuple[str, str]:
-    """The cheapest model whose validation error is within one standard error of the best, or small enough, and why.
+    """The cheapest stable model whose validation error is within one standard error of the best, or small enough.
 
     Source: the one-standard-error rule of Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3,
     with the standard error over seeds.
@@ -55,10 +58,25 @@ def recommend(
         valid_errors: Validation error of each seed, by model; a single one where no seed is drawn.
         cost: ms per frame, by model.
         accurate_enough: Error below which models count as equally accurate; None for no such limit.
+        unstable: Models that failed a check of stability; they are chosen from only if there are no others.
 
     Returns:
         Name of the model, and the reason in words.
     """
+    stable = {name: errors for name, errors in valid_errors.items() if name not in unstable}
+    chosen, reason = _recommend(stable or valid_errors, cost, accurate_enough)
+    if not stable:
+        return chosen, f"{reason} No model passed every check of stability: see which failed before you use it."
+    set_aside = len(valid_errors) - len(stable)
+    return (
+        chosen,
+        f"{reason} It passed every check of stability{f', which {set_aside} others did not' * bool(set_aside)}.",
+    )
+
+
+def _recommend(
+    valid_errors: Mapping[str, Sequence[float]], cost: Mapping[str, float], accurate_enough: float | None
+) -> tuple[str, str]:
     means = {name: sum(values) / len(values) for name, values in valid_errors.items()}
     best = min(means, key=means.__getitem__)
     within = means[best] + _standard_error(valid_errors[best])

@@ -50,6 +50,16 @@ def test_the_cheapest_that_is_accurate_enough_is_recommended():
     assert recommend(errors, cost, accurate_enough=1e-7)[0] == "best"
 
 
+def test_a_model_that_failed_a_check_of_stability_is_not_recommended_beside_one_that_passed():
+    errors, cost = {"best": [0.1, 0.1], "steady": [0.3, 0.3]}, {"best": 1.0, "steady": 2.0}
+    chosen, reason = recommend(errors, cost, unstable=["best"])
+    assert chosen == "steady"
+    assert "passed every check of stability, which 1 others did not" in reason
+    chosen, reason = recommend(errors, cost, unstable=["best", "steady"])
+    assert chosen == "best"
+    assert "No model passed every check" in reason
+
+
 def test_the_best_is_recommended_where_none_cheaper_is_as_accurate():
     chosen, reason = recommend({"best": [1.0, 1.0], "far": [2.0, 2.0]}, {"best": 10.0, "far": 1.0})
     assert chosen == "best"
