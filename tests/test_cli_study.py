@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder, *long]
 
     def ready():
-        return any(path.stat().st_size for path in folder.glob("trials/random_*/log.jsonl"))
+        return any(path.stat().st_size for path in folder.glob("trials/initialization_*/log.jsonl"))
 
     status, error = interrupt(command, ready)
     assert status == 130
@@ -180,7 +180,7 @@ def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     status, out, _ = cconv("study", "status", folder, "--json")
     facts = json.loads(out)
     assert facts["state"] == "interrupted"
-    assert facts["trials"]["random"]["interrupted"] >= 1
+    assert facts["trials"]["initialization"]["interrupted"] >= 1
     assert "interrupted" in (folder / "report.html").read_text()
     assert load_model(next(folder.glob("trials/*/checkpoint"))).num_parameters > 0
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from cconv.report.tables import finalists_table
 
 _BASELINE, _FINALIST, _RECOMMENDED = "#c44e52", "#4c72b0", "#55a868"
-_STAGES = {"closed_form": "#8172b3", "random": "#4c72b0", "adaptive": "#dd8452"}
+_STAGES = {"closed_form": "#8172b3", "initialization": "0.6", "random": "#4c72b0", "adaptive": "#dd8452"}
 
 
 def speed_accuracy_chart(summary: Mapping) -> Figure:

@@ -75,6 +75,12 @@ class ClosedFormConfig(StrictModel):
     ridge: float = Field(1e-10, ge=0)
 
 
+class InitializationConfig(StrictModel):
+    """Trainings of the baseline that differ in initial weights alone; no stage of that kind without this table."""
+
+    seeds: int = Field(5, ge=2)
+
+
 class SelectionConfig(StrictModel):
     """When accurate is accurate enough: models below `accurate_enough` count as equal, and the cheapest wins."""
 
@@ -114,6 +120,7 @@ class StudyConfig(StrictModel):
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
     closed_form: ClosedFormConfig | None = None
+    initialization: InitializationConfig | None = None
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
     cost: CostConfig = CostConfig()

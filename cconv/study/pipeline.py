@@ -1,4 +1,4 @@
-"""The whole study: closed forms, random search, adaptive search, finalists, summary."""
+"""The whole study: closed forms, initialisation, random search, adaptive search, finalists, summary."""
 
 import time
 from collections import Counter
@@ -20,6 +20,7 @@ from cconv.study.finalists import (
     finalist_jobs,
     retrained_finalists,
 )
+from cconv.study.initialization import train_many_seeds, variance_decomposition
 from cconv.study.observer import Observer
 from cconv.study.problem import load_problem, open_study_data, study_samples
 from cconv.study.records import OUTCOMES, RunFolder, TrialRecord
@@ -86,6 +87,9 @@ def _stages(session: Session, progress: Progress) -> Iterable[str]:
         screen_closed_forms(study, session.space, session.problem, run, progress)
         fit_closed_form_finalists(study, session.problem, run, progress)
     with ray_session(session):
+        if study.initialization is not None:
+            yield "initialization"
+            train_many_seeds(session)
         yield "random"
         random_search(session)
         if study.search.adaptive_trials:
@@ -155,6 +159,7 @@ def _summarize(session: Session, dataset: Dataset, progress: Progress) -> dict:
             {each.id: (tests[each.id]["normalized_mse"], costs[each.id].ms_per_frame) for each in finalists}
         ),
         "recommended": {"id": chosen, "reason": reason},
+        "initialization": variance_decomposition(run),
         "trials": count_outcomes([*run.trials(), *retrainings]),
     }
 

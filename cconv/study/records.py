@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cconv.errors import ConfigError, DataError
 
-SEARCHES = ("closed_form", "random", "adaptive")
+SEARCHES = ("closed_form", "initialization", "random", "adaptive")  # stages whose trials stand in trials/
 # Ray and Optuna need a finite number where a trial diverged; our records hold none there.
 DIVERGED_ERROR = 1e9
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
@@ -46,7 +46,7 @@ class TrialRecord:
 
     Attributes:
         id: Name of its folder.
-        stage: "closed_form", "random", "adaptive", "finalists" or "train".
+        stage: "closed_form", "initialization", "random", "adaptive", "finalists" or "train".
         parameters: Hyperparameters that were drawn.
         config: Resolved network and training settings, seeds, number of parameters.
         log: One entry an evaluation: updates, train_loss, valid_normalized_mse, learning_rate, seconds, diverged.

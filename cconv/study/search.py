@@ -107,8 +107,8 @@ def adaptive_search(session: Session) -> None:
 
     study, space = session.study, session.space
     journal = open_journal(session.run.path / "optuna.journal")
-    trained = [record for record in session.run.trials() if not record.is_closed_form]
-    mirror_trials(trained, space, study.training.updates, journal, study.name)
+    searched = [record for record in session.run.trials() if record.stage == "random"]
+    mirror_trials(searched, space, study.training.updates, journal, study.name)
     sampler = RungAwareOptunaSearch(
         optuna_distributions(space),
         metric=METRIC,
