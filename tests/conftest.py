@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from cconv.cli import main
 
 SCRIPT = Path(sys.executable).parent / "cconv"
+BENCHMARKS = Path(__file__).parents[1] / "experiments" / "benchmarks"
 SMOKE = Path(__file__).parents[1] / "experiments" / "smoke.toml"
 
 
@@ -17,6 +19,26 @@ SMOKE = Path(__file__).parents[1] / "experiments" / "smoke.toml"
 def generator():
     """A seeded source of random numbers; a test's draws do not depend on other tests."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def benchmark_script(monkeypatch):
+    """Load a script of experiments/benchmarks as a module, given its name."""
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(f"{name}_benchmark", BENCHMARKS / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, spec.name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+@pytest.fixture
+def solver_benchmark(benchmark_script):
+    """The checks of the solver, with channel flows and their series solutions."""
+    return benchmark_script("solver")
 
 
 @pytest.fixture

@@ -1,22 +1,14 @@
 """The benchmark script runs and writes what it says, on layers too small for its figures to mean anything."""
 
-import importlib.util
 import os
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[1] / "experiments" / "benchmarks" / "continuous_conv.py"
-
 
 @pytest.fixture
-def benchmark(monkeypatch):
-    spec = importlib.util.spec_from_file_location("continuous_conv_benchmark", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, module)
-    spec.loader.exec_module(module)
+def benchmark(benchmark_script):
+    module = benchmark_script("continuous_conv")
     threads = torch.get_num_threads()
     yield module
     torch.set_num_threads(threads)

@@ -222,6 +222,7 @@ def show(
 
     All frames of a file share one scale of colours; outliers are beyond its pointed ends.
     """
+    from cconv.data.splits import evenly_spaced
     from cconv.data.vtk import write_vtk
     from cconv.report import particles
 
@@ -244,11 +245,6 @@ def show(
         results.print(f"Animation of {len(sequence)} frames: {animate}")
     particles.write_picture(figure, picture)
     results.print(f"Picture of {len(chosen)} frames: {picture}")
-
-
-def evenly_spaced(num_frames: int, count: int) -> list[int]:
-    """Up to `count` different frames from the first to the last."""
-    return sorted({round(k * (num_frames - 1) / (count - 1)) for k in range(count)})
 
 
 def parse_frames(text: str) -> list[int]:

@@ -1,7 +1,7 @@
 """What a network is given: features of fluid particles and boundary points, and their standardisation."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -34,6 +34,11 @@ class Inputs:
     def num_particles(self) -> int:
         """Number of fluid particles N."""
         return len(self.positions)
+
+    def double(self) -> "Inputs":
+        """The same in float64."""
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: tensor.double() for name, tensor in tensors.items()})
 
 
 @dataclass(frozen=True, kw_only=True)

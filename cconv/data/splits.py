@@ -22,6 +22,11 @@ def share_out(total: int, fractions: Sequence[float]) -> list[int]:
     return [total - sum(others), *others]
 
 
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Up to `count` different indices of `total` things, from the first to the last."""
+    return np.unique(np.linspace(0, total - 1, count).round().astype(int)).tolist()
+
+
 def split_by_trajectory(names: Sequence[str], fractions: Sequence[float], seed: int) -> list[tuple[Block, ...]]:
     """Whole trajectories by shares, drawn by a seeded permutation, in their own order within a split."""
     order = np.random.default_rng(seed).permutation(len(names))

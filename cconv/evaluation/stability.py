@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cconv.data.features import fluid_state
 from cconv.data.targets import make_sample
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.evaluation.metrics import frame_errors
 from cconv.neighbors import radius_graph
-from cconv.sph.operators import density
 from cconv.training.field_model import FieldModel
 
 NOT_FINITE = 1e9  # stands for an error that is infinite or no number, so that files can hold it
@@ -137,11 +137,8 @@ def stressed_frames(frame: Frame, scene: Scene, seed: int = 0) -> dict[str, tupl
 def precision(model: FieldModel, frame: Frame, scene: Scene) -> float:
     """Largest difference between predictions in float32 and float64, by the root mean square of the prediction."""
     sample = make_sample(frame, scene, model.config.task, model.kernel)
-    exact_model, inputs = deepcopy(model).double(), sample.inputs
-    names = ("positions", "features", "boundary_positions", "boundary_features")
-    tensors = {name: getattr(inputs, name) for name in names}
-    exact = exact_model.predict(replace(inputs, **{k: t if t is None else t.double() for k, t in tensors.items()}))
-    difference = (model.predict(inputs).double() - exact).abs().max()
+    exact = deepcopy(model).double().predict(sample.inputs.double())
+    difference = (model.predict(sample.inputs).double() - exact).abs().max()
     return _finite(difference / exact.square().mean().sqrt().clamp_min(torch.finfo(torch.float64).tiny))
 
 
@@ -158,10 +155,7 @@ def density_rollout(model: FieldModel, trajectory: Trajectory, scene: Scene, lim
         sample = make_sample(frame, scene, model.config.task, model.kernel)
         rates.append(model.predict(sample.inputs)[:, 0].double())
         references.append(sample.target[:, 0].double())
-    fluid = trajectory.particle_types == ParticleType.FLUID
-    first = trajectory.positions[0, fluid].double()
-    edges = radius_graph(first, model.kernel.support_radius, scene.box)
-    start = density(trajectory.masses[fluid].double(), edges, model.kernel)
+    start = fluid_state(trajectory[0], scene.box, model.kernel).densities
     integrated, reference = (_integrate(start, torch.stack(values), scene.frame_dt) for values in (rates, references))
     deviations = integrated / reference - 1
     usual = deviations.abs().quantile(0.95, dim=1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from cconv.domain import Box
 from cconv.scenes.relaxed import glass
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
+from cconv.scenes.walls import Walls, lattice, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,17 +58,13 @@ class Cuboid3D(SimulatedScene):
     }
 
     @property
-    def _margin(self) -> float:
-        return WALL_LAYERS * self.particle_spacing
-
-    @property
     def _counts(self) -> list[int]:
         return [whole_cells(self.side, self.particle_spacing)] * 3
 
     @property
     def box(self) -> Box:
         """The cube from 0 to its side, and its walls around it."""
-        return Box((-self._margin,) * 3, (self.side + self._margin,) * 3)
+        return Box((-self.wall_thickness,) * 3, (self.side + self.wall_thickness,) * 3)
 
     @property
     def walls(self) -> Walls:

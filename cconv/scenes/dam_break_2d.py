@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around
+from cconv.scenes.walls import Walls, walls_around
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +59,12 @@ class DamBreak2D(SimulatedScene):
 
     @property
     def _corner(self) -> tuple[float, float]:
-        margin = WALL_LAYERS * self.particle_spacing
-        return (margin, margin)
+        return (self.wall_thickness, self.wall_thickness)
 
     @property
     def box(self) -> Box:
         """The tank within its walls, and a tenth of room above and beside them, as published."""
-        upper = (length + 2 * WALL_LAYERS * self.particle_spacing + 0.1 for length in self.tank)
+        upper = (length + 2 * self.wall_thickness + 0.1 for length in self.tank)
         return Box((0.0, 0.0), upper)
 
     @property
@@ -76,6 +75,6 @@ class DamBreak2D(SimulatedScene):
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A lattice relaxed in a closed box of the column's size, at rest."""
         counts = self._counts(self.column)
-        start = lattice(counts, self.particle_spacing, self._corner)
-        positions = self.relaxed(start, self.box, walls_around(counts, self.particle_spacing, self._corner), generator)
+        closed = walls_around(counts, self.particle_spacing, self._corner)
+        positions = self.relaxed_lattice(counts, self._corner, closed, generator)
         return positions, torch.zeros_like(positions)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
+from cconv.scenes.walls import Walls, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +29,8 @@ class _LidDrivenCavity(SimulatedScene):
     depth = ()
 
     @property
-    def _margin(self) -> float:
-        return WALL_LAYERS * self.particle_spacing
-
-    @property
     def _corner(self) -> tuple[float, ...]:
-        return (self._margin, self._margin, *(0.0 for _ in self.depth))
+        return (self.wall_thickness, self.wall_thickness, *(0.0 for _ in self.depth))
 
     @property
     def _counts(self) -> list[int]:
@@ -43,17 +39,17 @@ class _LidDrivenCavity(SimulatedScene):
     @property
     def box(self) -> Box:
         """The unit cavity within its walls."""
-        side = 1 + 2 * self._margin
+        side = 1 + 2 * self.wall_thickness
         return Box((0.0,) * self.dim, (side, side, *self.depth), (True, False, *(True for _ in self.depth)))
 
     @property
     def walls(self) -> Walls:
         """Walls at rest but for those above the cavity, which slide with speed 1."""
         at_rest = self._walls_at_rest
-        lid = at_rest.positions[:, 1] > 1 + self._margin
+        lid = at_rest.positions[:, 1] > 1 + self.wall_thickness
         velocities = torch.zeros_like(at_rest.positions)
         velocities[lid, 0] = 1.0
-        lowest_of_lid = at_rest.positions[:, 1] < 1 + self._margin + self.particle_spacing
+        lowest_of_lid = at_rest.positions[:, 1] < 1 + self.wall_thickness + self.particle_spacing
         return replace(at_rest, velocities=velocities, stored=torch.where(lid, lowest_of_lid, at_rest.stored))
 
     @property
@@ -64,8 +60,7 @@ class _LidDrivenCavity(SimulatedScene):
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice at rest."""
-        start = lattice(self._counts, self.particle_spacing, self._corner)
-        positions = self.relaxed(start, self.box, self._walls_at_rest, generator)
+        positions = self.relaxed_lattice(self._counts, self._corner, self._walls_at_rest, generator)
         return positions, torch.zeros_like(positions)
 
 

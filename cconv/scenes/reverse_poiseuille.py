@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import Walls, lattice, whole_cells
+from cconv.scenes.walls import whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +44,7 @@ class _ReversePoiseuille(SimulatedScene):
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice at rest."""
         counts = [whole_cells(length, self.particle_spacing) for length in self.box.lengths]
-        start = lattice(counts, self.particle_spacing, self.box.lower)
-        positions = self.relaxed(start, self.box, Walls.none(self.dim), generator)
+        positions = self.relaxed_lattice(counts, self.box.lower, self.walls, generator)
         return positions, torch.zeros_like(positions)
 
 

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.scenes.relaxed import relaxed
-from cconv.scenes.walls import Walls
+from cconv.scenes.walls import WALL_LAYERS, Walls, lattice
 from cconv.sph.kernels import QuinticSpline
 from cconv.sph.solver import (
     EquationOfState,
@@ -190,11 +191,18 @@ class SimulatedScene(ABC):
             is_wall=torch.arange(particles) < len(walls),
         )
 
-    def relaxed(self, positions: Tensor, box: Box, walls: Walls, generator: torch.Generator) -> Tensor:
-        """A lattice (N, D) shaken and spread evenly within a box and its walls."""
+    @property
+    def wall_thickness(self) -> float:
+        """Of the layers that the solver needs."""
+        return WALL_LAYERS * self.particle_spacing
+
+    def relaxed_lattice(
+        self, counts: Sequence[int], lower: Sequence[float], walls: Walls, generator: torch.Generator
+    ) -> Tensor:
+        """Positions (N, D) of a lattice of `counts` cells from `lower` on, shaken and spread evenly between walls."""
         return relaxed(
-            positions,
-            box=box,
+            lattice(counts, self.particle_spacing, lower),
+            box=self.box,
             walls=walls,
             spacing=self.particle_spacing,
             generator=generator,

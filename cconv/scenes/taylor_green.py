@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import Walls, lattice, whole_cells
+from cconv.scenes.walls import whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +49,7 @@ class TaylorGreen2D(SimulatedScene):
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice that moves with the vortices."""
         cells = whole_cells(1.0, self.particle_spacing)
-        start = lattice([cells] * 2, self.particle_spacing, (0.0, 0.0))
-        positions = self.relaxed(start, self.box, Walls.none(2), generator)
+        positions = self.relaxed_lattice([cells] * 2, self.box.lower, self.walls, generator)
         return positions, self.velocity(positions, 0.0)
 
     def velocity(self, positions: Tensor, time: float) -> Tensor:
@@ -97,8 +96,7 @@ class TaylorGreen3D(SimulatedScene):
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         r"""A relaxed lattice that moves with :math:`u = (\sin x \cos y \cos z, \; -\cos x \sin y \cos z, \; 0)`."""
         cells = whole_cells(2 * math.pi, self.particle_spacing)
-        start = lattice([cells] * 3, self.particle_spacing, (0.0,) * 3)
-        positions = self.relaxed(start, self.box, Walls.none(3), generator)
+        positions = self.relaxed_lattice([cells] * 3, self.box.lower, self.walls, generator)
         x, y, z = positions.unbind(dim=1)
         u = torch.stack([x.sin() * y.cos() * z.cos(), -x.cos() * y.sin() * z.cos(), torch.zeros_like(x)], dim=1)
         return positions, u

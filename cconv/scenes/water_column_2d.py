@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.scenes.walls import WALL_LAYERS, Walls, lattice, walls_around, whole_cells
+from cconv.scenes.walls import Walls, walls_around, whole_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +39,7 @@ class WaterColumn2D(SimulatedScene):
 
     @property
     def _corner(self) -> tuple[float, float]:
-        margin = WALL_LAYERS * self.particle_spacing
-        return (margin, margin)
+        return (self.wall_thickness, self.wall_thickness)
 
     @property
     def _counts(self) -> tuple[int, int]:
@@ -50,8 +49,8 @@ class WaterColumn2D(SimulatedScene):
     @property
     def box(self) -> Box:
         """The water, its walls, and as much room above."""
-        margin = WALL_LAYERS * self.particle_spacing
-        return Box((0.0, 0.0), (1 + 2 * margin, 1.5 + 2 * margin))
+        around = 2 * self.wall_thickness
+        return Box((0.0, 0.0), (1 + around, 1.5 + around))
 
     @property
     def walls(self) -> Walls:
@@ -61,7 +60,6 @@ class WaterColumn2D(SimulatedScene):
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A lattice relaxed in a closed box of the water's size, at rest."""
-        start = lattice(self._counts, self.particle_spacing, self._corner)
         closed = walls_around(self._counts, self.particle_spacing, self._corner)
-        positions = self.relaxed(start, self.box, closed, generator)
+        positions = self.relaxed_lattice(self._counts, self._corner, closed, generator)
         return positions, torch.zeros_like(positions)

@@ -29,6 +29,15 @@ def _nearest_image(difference, length):
     return difference
 
 
+@njit(inline="always")
+def _displacement(positions, i, j, lengths):
+    """Components of x_i - x_j, and its squared length."""
+    dx = _nearest_image(positions[i, 0] - positions[j, 0], lengths[0])
+    dy = _nearest_image(positions[i, 1] - positions[j, 1], lengths[1])
+    dz = _nearest_image(positions[i, 2] - positions[j, 2], lengths[2])
+    return dx, dy, dz, dx * dx + dy * dy + dz * dz
+
+
 @_compile
 def rows_of_pairs(pairs, is_wall):
     """Both directions of pairs (P, 2) in compressed rows: splits (N + 1,) and neighbours, ascending within a row.
@@ -93,14 +102,10 @@ def sum_densities(first, last, splits, neighbors, positions, lengths, masses, su
     for i in range(first, last):
         if is_wall[i]:
             continue
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         total = table[0, 3]
         for place in range(splits[i], splits[i + 1]):
             j = neighbors[place]
-            dx = _nearest_image(x - positions[j, 0], lengths[0])
-            dy = _nearest_image(y - positions[j, 1], lengths[1])
-            dz = _nearest_image(z - positions[j, 2], lengths[2])
-            squared = dx * dx + dy * dy + dz * dz
+            _, _, _, squared = _displacement(positions, i, j, lengths)
             if squared < support * support:
                 total += look_up(table, math.sqrt(squared) * scale)
         densities[i] = masses[i] * total
@@ -115,15 +120,11 @@ def density_rates(
     for i in range(first, last):
         if is_wall[i]:
             continue
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         ux, uy, uz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         total = 0.0
         for place in range(splits[i], splits[i + 1]):
             j = neighbors[place]
-            dx = _nearest_image(x - positions[j, 0], lengths[0])
-            dy = _nearest_image(y - positions[j, 1], lengths[1])
-            dz = _nearest_image(z - positions[j, 2], lengths[2])
-            squared = dx * dx + dy * dy + dz * dz
+            dx, dy, dz, squared = _displacement(positions, i, j, lengths)
             if 0 < squared < support * support:
                 distance = math.sqrt(squared)
                 approach = (ux - velocities[j, 0]) * dx + (uy - velocities[j, 1]) * dy + (uz - velocities[j, 2]) * dz
@@ -140,14 +141,10 @@ def shepard_densities(
     for i in range(first, last):
         if is_wall[i]:
             continue
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         mass, volume = masses[i] * table[0, 3], masses[i] / densities[i] * table[0, 3]
         for place in range(splits[i], splits[i + 1]):
             j = neighbors[place]
-            dx = _nearest_image(x - positions[j, 0], lengths[0])
-            dy = _nearest_image(y - positions[j, 1], lengths[1])
-            dz = _nearest_image(z - positions[j, 2], lengths[2])
-            squared = dx * dx + dy * dy + dz * dz
+            _, _, _, squared = _displacement(positions, i, j, lengths)
             if squared < support * support:
                 weight = masses[j] * look_up(table, math.sqrt(squared) * scale)
                 mass += weight
@@ -168,7 +165,6 @@ def extrapolate_to_walls(
     for i in range(first, last):
         if not is_wall[i]:
             continue
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         total = pressure = 0.0
         u = np.zeros(3)
         v = np.zeros(3)
@@ -176,10 +172,7 @@ def extrapolate_to_walls(
             j = neighbors[place]
             if is_wall[j]:
                 continue
-            dx = _nearest_image(x - positions[j, 0], lengths[0])
-            dy = _nearest_image(y - positions[j, 1], lengths[1])
-            dz = _nearest_image(z - positions[j, 2], lengths[2])
-            squared = dx * dx + dy * dy + dz * dz
+            dx, dy, dz, squared = _displacement(positions, i, j, lengths)
             if squared < support * support:
                 weight = look_up(table, math.sqrt(squared) * scale)
                 total += weight
@@ -210,7 +203,6 @@ def accelerations(
     for i in range(first, last):
         if is_wall[i]:
             continue
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
         ux, uy, uz = velocities[i, 0], velocities[i, 1], velocities[i, 2]
         sx = transport_velocities[i, 0] - ux
         sy = transport_velocities[i, 1] - uy
@@ -220,10 +212,7 @@ def accelerations(
         ax = ay = az = bx = by = bz = 0.0
         for place in range(splits[i], splits[i + 1]):
             j = neighbors[place]
-            dx = _nearest_image(x - positions[j, 0], lengths[0])
-            dy = _nearest_image(y - positions[j, 1], lengths[1])
-            dz = _nearest_image(z - positions[j, 2], lengths[2])
-            squared = dx * dx + dy * dy + dz * dz
+            dx, dy, dz, squared = _displacement(positions, i, j, lengths)
             if not 0 < squared < support * support:
                 continue
             distance = math.sqrt(squared)

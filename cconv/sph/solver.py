@@ -25,15 +25,14 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, SimulationError, check_choice, check_shape
-from cconv.neighbors import half_list, radius_graph
-from cconv.ops.workers import run_on_workers
+from cconv.neighbors import radius_graph
 from cconv.sph import pair_loops
 from cconv.sph.kernel_table import kernel_tables
 from cconv.sph.kernels import AbstractKernel
+from cconv.sph.neighbor_list import NeighborList, periodic_lengths
 
 DENSITY_SCHEMES = ("summation", "evolution")
 CFL = 0.25
-_PAIRS_PER_WORKER = 20_000  # fewer cost less than waking a thread
 
 Force = Callable[[Tensor], Tensor]
 
@@ -61,9 +60,8 @@ class EquationOfState:
 
     def pressure(self, densities: np.ndarray) -> np.ndarray:
         """p(ρ)."""
-        return self.reference_pressure * ((densities / self.rest_density) ** self.exponent - 1) + (
-            self.background_pressure
-        )
+        compression = (densities / self.rest_density) ** self.exponent - 1
+        return self.reference_pressure * compression + self.background_pressure
 
     def density(self, pressures: np.ndarray) -> np.ndarray:
         """ρ(p), the inverse."""
@@ -190,9 +188,9 @@ class WeaklyCompressibleSPH:
         self._transport_pressure, self._wall_friction = transport_pressure, wall_friction
         self._artificial = artificial_viscosity * kernel.smoothing_length * equation_of_state.sound_speed
         self._force = force
-        self._lengths, self._lower = _periodic_lengths(box), np.zeros(3)
+        self._lengths, self._lower = periodic_lengths(box), np.zeros(3)
         self._lower[: box.dim] = box.lower
-        self._neighbors = _NeighborList(box, kernel.support_radius, skin * particle_spacing)
+        self._neighbors = NeighborList(box, kernel.support_radius, skin * particle_spacing)
 
     def initial_state(
         self, positions: Tensor, velocities: Tensor, masses: Tensor, viscosities: Tensor, is_wall: Tensor
@@ -263,7 +261,8 @@ class WeaklyCompressibleSPH:
     def _accelerations(self, now: "_Arrays") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Accelerations (N, 3) and those of the transport velocity, zero for walls; densities (N,) of all."""
         table, slopes = self._tables
-        support, eos, rows = self._kernel.support_radius, self.equation_of_state, self._neighbors.rows(now)
+        support, eos = self._kernel.support_radius, self.equation_of_state
+        rows = self._neighbors.rows(now.positions, now.is_wall)
         force = np.zeros_like(now.positions)
         if self._force is not None:
             force[:, : self.box.dim] = self._force(_unpadded(now.positions, self.box.dim)).numpy()
@@ -294,10 +293,8 @@ class WeaklyCompressibleSPH:
         if self._density == "summation":
             return self._summed(now)
         table, slopes = self._tables
-        rows, common = (
-            self._neighbors.rows(now),
-            (now.positions, self._lengths, now.masses, self._kernel.support_radius),
-        )
+        rows = self._neighbors.rows(now.positions, now.is_wall)
+        common = (now.positions, self._lengths, now.masses, self._kernel.support_radius)
         rates = np.zeros_like(now.densities)
         rows.visit(pair_loops.density_rates, *common, slopes, now.is_wall, now.velocities, now.densities, rates)
         densities = now.densities + time_step * rates
@@ -308,7 +305,7 @@ class WeaklyCompressibleSPH:
 
     def _summed(self, now: "_Arrays") -> np.ndarray:
         densities = now.densities.copy()
-        self._neighbors.rows(now).visit(
+        self._neighbors.rows(now.positions, now.is_wall).visit(
             pair_loops.sum_densities, now.positions, self._lengths, now.masses, self._kernel.support_radius,
             self._tables[0], now.is_wall, densities,
         )  # fmt: skip
@@ -342,52 +339,6 @@ def _unpadded(vectors: np.ndarray, dim: int) -> Tensor:
     return torch.from_numpy(vectors[:, :dim].copy())
 
 
-class _Rows:
-    """Neighbours in compressed rows, shared out among threads by their number."""
-
-    def __init__(self, splits: np.ndarray, neighbors: np.ndarray):
-        self._lists = (splits, neighbors)
-        workers = max(1, min(torch.get_num_threads(), len(neighbors) // _PAIRS_PER_WORKER))
-        inner = np.searchsorted(splits, np.linspace(0, len(neighbors), workers + 1)[1:-1])
-        self._bounds = [0, *inner.tolist(), len(splits) - 1]
-
-    def visit(self, loop: Callable, *arguments) -> None:
-        """Run a loop over all rows."""
-        bounds = self._bounds
-        run_on_workers(
-            lambda worker: loop(bounds[worker], bounds[worker + 1], *self._lists, *arguments), len(bounds) - 1
-        )
-
-
-class _NeighborList:
-    """Neighbours within reach + skin, searched anew once a particle has moved by half of the skin."""
-
-    def __init__(self, box: Box, reach: float, skin: float):
-        self._box, self._reach, self._skin = box, reach, skin
-        self._lengths = _periodic_lengths(box)
-        self._searched_at, self._walls_then = np.empty((0, 3)), np.empty(0, bool)
-        self._found: _Rows | None = None
-
-    def rows(self, now: _Arrays) -> _Rows:
-        """Rows of all pairs with a fluid particle."""
-        holds = np.array_equal(now.is_wall, self._walls_then) and not pair_loops.moved_further(
-            now.positions, self._searched_at, self._lengths, 0.5 * self._skin
-        )
-        if not holds:
-            positions = _unpadded(now.positions, self._box.dim)
-            pairs = half_list(positions, self._reach + self._skin, self._box)
-            self._found = _Rows(*pair_loops.rows_of_pairs(pairs, now.is_wall))
-            self._searched_at, self._walls_then = now.positions, now.is_wall.copy()
-        return self._found
-
-
-def _periodic_lengths(box: Box) -> np.ndarray:
-    """Lengths of the periodic axes (3,), infinite for others."""
-    lengths = np.full(3, np.inf)
-    lengths[: box.dim] = np.where(box.periodic, box.lengths, np.inf)
-    return lengths
-
-
 def _check_wide_enough(box: Box, reach: float) -> None:
     for axis, (length, periodic) in enumerate(zip(box.lengths, box.periodic, strict=True)):
         if periodic and length < 2 * reach:
@@ -397,15 +348,20 @@ def _check_wide_enough(box: Box, reach: float) -> None:
             )
 
 
+def _outside(positions: np.ndarray, box: Box) -> np.ndarray:
+    """Which positions (N, D or more) lie beyond the bounds of the box (N,)."""
+    along = positions[:, : box.dim]
+    return ((along < box.lower) | (along > box.upper)).any(axis=1)
+
+
 def _check_inside(positions: Tensor, box: Box) -> None:
-    lower, upper = torch.tensor(box.lower, dtype=torch.float64), torch.tensor(box.upper, dtype=torch.float64)
-    outside = ((positions < lower) | (positions > upper)).any(dim=1)
+    outside = _outside(positions.numpy(), box)
     if outside.any():
-        index = int(outside.nonzero()[0, 0])
+        index = int(outside.argmax())
         place = ", ".join(f"{value:g}" for value in positions[index].tolist())
         raise ConfigError(
-            f"`positions` must lie within the box, got {int(outside.sum())} outside, the first is particle {index} at "
-            f"({place}); move them or enlarge the box."
+            f"`positions` must lie within the box, got {int(outside.sum())} outside, the first is particle {index} "
+            f"at ({place}); move them or enlarge the box."
         )
 
 
@@ -420,11 +376,9 @@ def _check_apart(positions: Tensor, box: Box, particle_spacing: float) -> None:
 
 
 def _check_whole(positions: np.ndarray, box: Box, steps: int) -> None:
-    inside = np.isfinite(positions).all(axis=1)
-    for axis in range(box.dim):
-        inside &= (positions[:, axis] >= box.lower[axis]) & (positions[:, axis] <= box.upper[axis])
-    if not inside.all():
+    lost = _outside(positions, box) | ~np.isfinite(positions).all(axis=1)
+    if lost.any():
         raise SimulationError(
-            f"The simulation blew up at step {steps}: {int((~inside).sum())} particles are no longer in the box; take "
+            f"The simulation blew up at step {steps}: {int(lost.sum())} particles are no longer in the box; take "
             "a smaller time step or a larger speed of sound."
         )

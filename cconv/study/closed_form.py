@@ -12,6 +12,7 @@ from itertools import product
 
 import numpy as np
 
+from cconv.data.splits import evenly_spaced
 from cconv.data.targets import Sample
 from cconv.errors import ConfigError
 from cconv.evaluation.cost import flops_per_particle
@@ -58,8 +59,10 @@ def screen_closed_forms(
     settings = study.closed_form
     layers = single_layers(space, study.network, settings.values_per_range)
     layers = _draw(layers, settings.max_candidates, study.seeds.search)
-    train = _evenly(problem.train_samples, settings.screening_frames)
-    valid = _evenly(problem.valid_samples, settings.screening_frames)
+    train, valid = (
+        [samples[place] for place in evenly_spaced(len(samples), settings.screening_frames)]
+        for samples in (problem.train_samples, problem.valid_samples)
+    )
     for number, parameters in enumerate(progress(layers, "closed forms")):
         folder = run.trial(f"{STAGE}_{number:04d}")
         _fit_and_record(parameters, study, problem, (train, valid), folder, STAGE, study.seeds.init)
@@ -137,12 +140,6 @@ def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[st
         ranked.append((rank[layer["basis"]], layer))
     chosen = [layer for _, layer in sorted(ranked, key=lambda item: item[0])[:count]]
     return [layer for layer in layers if layer in chosen]
-
-
-def _evenly(samples: Sequence[Sample], count: int) -> list[Sample]:
-    """At most `count` samples, evenly over all."""
-    places = np.linspace(0, len(samples) - 1, min(count, len(samples))).round().astype(int)
-    return [samples[place] for place in places]
 
 
 def _values(domain: Parameter, count: int) -> list[Value]:

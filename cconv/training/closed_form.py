@@ -1,10 +1,8 @@
 """The closed form: models of a single layer, fitted by least squares in seconds."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 from cconv.data.dataset import Dataset
-from cconv.data.features import Inputs
 from cconv.data.targets import Sample, iterate_samples
 from cconv.errors import ConfigError
 from cconv.nn.closed_form import NormalEquations, linear_layer
@@ -70,7 +68,7 @@ def solve_closed_form(
     layer = linear_layer(model.network)
     equations: list[NormalEquations] = []
     for sample in progress(samples):
-        inputs = _double(sample.inputs)
+        inputs = sample.inputs.double()
         terms = layer.terms(*model.network_inputs(inputs, model.geometry(inputs)))
         targets = layer.targets(model.standardize_target(sample.target.double()))
         if not equations:
@@ -78,9 +76,3 @@ def solve_closed_form(
         for system, x, y in zip(equations, terms, targets, strict=True):
             system.add(x, y)
     layer.assign([system.solve(ridge) for system in equations])
-
-
-def _double(inputs: Inputs) -> Inputs:
-    names = ("positions", "features", "boundary_positions", "boundary_features")
-    tensors = {name: getattr(inputs, name) for name in names}
-    return replace(inputs, **{name: tensor.double() for name, tensor in tensors.items() if tensor is not None})

@@ -12,7 +12,7 @@ from cconv import Box, radius_graph
 from cconv.errors import ConfigError, ShapeError, SimulationError
 from cconv.scenes.walls import lattice, walls_around
 from cconv.sph import KERNELS, QuinticSpline, density, density_rate
-from cconv.sph import solver as module
+from cconv.sph import neighbor_list as module
 from cconv.sph.kernel_table import kernel_tables
 from cconv.sph.pair_loops import look_up
 from cconv.sph.solver import EquationOfState, WeaklyCompressibleSPH, check_time_step, largest_time_step
@@ -289,64 +289,18 @@ def test_hydrostatic_pressure_holds_the_water_up():
     assert accelerations[: len(fluid)][deep].norm(dim=1).max() < 0.04
 
 
-def channel(wall_friction=True, lid_speed=0.0, force=0.0, viscosity=0.1, time=0.5, cells=20):
-    """Profile (cells,) of a channel of height 1, periodic along x, that starts at rest."""
-    spacing, columns = 1 / cells, 8
-    fluid = lattice((columns, cells), spacing, (0.0, 0.0))
-    walls = walls_around((columns, cells), spacing, (0.0, 0.0), [False, True])
-    box = Box((0.0, -3 * spacing), (columns * spacing, 1 + 3 * spacing), periodic=(True, False))
-    push = torch.tensor([force, 0.0], dtype=torch.float64)
-    eos = EquationOfState(sound_speed=10.0)
-    solver = solver_in(
-        box, spacing, equation_of_state=eos, wall_friction=wall_friction,
-        force=(lambda positions: push.expand_as(positions)) if force else None,
-        transport_pressure=eos.reference_pressure,
-    )  # fmt: skip
-    velocities = torch.zeros(len(fluid) + len(walls), 2, dtype=torch.float64)
-    velocities[len(fluid) :, 0] = lid_speed * (walls.positions[:, 1] > 1)
-    state = state_of(solver, torch.cat([fluid, walls.positions]), velocities, walls=len(walls), viscosity=viscosity)
-    step = largest_time_step(particle_spacing=spacing, sound_speed=10.0, reference_speed=1.0, viscosity=viscosity)
-    steps = round(time / step)
-    for _ in range(steps):
-        state = solver.step(state, time / steps)
-    heights, speeds = state.positions[: len(fluid), 1], state.velocities[: len(fluid), 0]
-    return heights, speeds
-
-
-def couette(y, time, viscosity, speed):
-    """Morris, Fox, Zhu, J. Comput. Phys. 136 (1997), eq. 25."""
-    terms = (
-        2 / (n * math.pi) * (-1) ** n * torch.sin(n * math.pi * y) * math.exp(-viscosity * (n * math.pi) ** 2 * time)
-        for n in range(1, 60)
-    )
-    return speed * (y + sum(terms))
-
-
-def poiseuille(y, time, viscosity, force):
-    """Morris, Fox, Zhu, J. Comput. Phys. 136 (1997), eq. 21."""
-    terms = (
-        4 * force / (viscosity * (math.pi * n) ** 3) * torch.sin(n * math.pi * y)
-        * math.exp(-viscosity * (n * math.pi) ** 2 * time)
-        for n in range(1, 60, 2)
-    )  # fmt: skip
-    return force / (2 * viscosity) * y * (1 - y) - sum(terms)
+@pytest.mark.parametrize("time", [0.3, 2.0])
+def test_couette_flow_follows_its_series(solver_benchmark, time):
+    assert solver_benchmark.channel_error(20, lid_speed=1.0, end=time) < 0.02
 
 
 @pytest.mark.parametrize("time", [0.3, 2.0])
-def test_couette_flow_follows_its_series(time):
-    heights, speeds = channel(lid_speed=1.0, time=time)
-    assert (speeds - couette(heights, time, 0.1, 1.0)).abs().max() < 0.02
+def test_poiseuille_flow_follows_its_series(solver_benchmark, time):
+    assert solver_benchmark.channel_error(20, force=0.8, end=time) < 0.02
 
 
-@pytest.mark.parametrize("time", [0.3, 2.0])
-def test_poiseuille_flow_follows_its_series(time):
-    heights, speeds = channel(force=0.8, time=time)
-    exact = poiseuille(heights, time, 0.1, 0.8)
-    assert (speeds - exact).abs().max() < 0.02 * exact.max()
-
-
-def test_walls_that_let_slip_hold_nothing():
-    heights, speeds = channel(force=0.8, time=0.3, wall_friction=False)
+def test_walls_that_let_slip_hold_nothing(solver_benchmark):
+    _, speeds = solver_benchmark.channel(20, force=0.8, end=0.3, wall_friction=False)
     torch.testing.assert_close(speeds, torch.full_like(speeds, 0.24), rtol=1e-3, atol=0.0)
 
 
