@@ -1,12 +1,14 @@
 """Neighbour search within a cutoff: a full list of pairs, sorted by receiver."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from cconv.cell_list import CellGrid, Cells, half_pairs, pairs_by_receiver, separations
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
 
@@ -52,6 +54,23 @@ class Edges:
     def __len__(self) -> int:
         return len(self.receivers)
 
+    def check(self) -> None:
+        """Require pairs that compiled loops can follow.
+
+        Raises:
+            ShapeError: If pairs, row splits and numbers of points do not fit, or a displacement is not finite.
+        """
+        if not _all_finite(self.displacements):
+            raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
+        lengths = {len(self.senders), len(self.receivers), len(self.displacements), int(self.row_splits[-1])}
+        fits = len(lengths) == 1 and int(self.row_splits[0]) == 0 and not (self.row_splits.diff() < 0).any()
+        within = _all_below(self.senders, self.num_senders) and _all_below(self.receivers, self.num_receivers)
+        if not (fits and within):
+            raise ShapeError(
+                f"`edges` must list pairs among {self.num_receivers} receivers and {self.num_senders} senders, got row "
+                "splits or indices beyond that; build them with `radius_graph`."
+            )
+
     def to(self, *args, **kwargs) -> "Edges":
         """Edges with distances and displacements converted, and all tensors moved, as `torch.Tensor.to` does."""
         displacements = self.displacements.to(*args, **kwargs)
@@ -69,7 +88,7 @@ class Edges:
 def radius_graph(
     positions: Tensor, cutoff: float, box: Box | None = None, queries: Tensor | None = None, include_self: bool = False
 ) -> Edges:
-    """All pairs within `cutoff`, found with SciPy's k-d tree.
+    """All pairs within `cutoff`, found in a list of cells on the CPU.
 
     Receivers are the queries (by default the positions themselves), senders the positions. Displacements and distances
     are differentiable with respect to both; which pairs are listed is not. Particles at exactly the same place are
@@ -95,25 +114,18 @@ def radius_graph(
     _check_cutoff(cutoff, box)
     if include_self and queries is not None:
         raise ConfigError("`include_self` must be False with `queries`: they are other points than `positions`.")
-    if queries is None:
-        receivers, senders = _pairs_within(_tree(positions, box), cutoff, include_self)
-    else:
-        receivers, senders = _pairs_between(_tree(queries, box), _tree(positions, box), cutoff)
-    pairs = np.sort(receivers * len(positions) + senders)  # sorting one number a pair is faster than an order of them
-    receivers = pairs // max(len(positions), 1)
-    senders = pairs - receivers * len(positions)
-    row_splits = np.zeros(len(receivers_at) + 1, dtype=np.int64)
-    np.cumsum(np.bincount(receivers, minlength=len(receivers_at)), out=row_splits[1:])
-    receivers, senders, row_splits = (
-        torch.from_numpy(array).to(positions.device) for array in (receivers, senders, row_splits)
+    grid, receivers, *others = _sorted_in_cells(
+        [receivers_at] if queries is None else [queries, positions], cutoff, box
     )
-    to, origin = receivers_at[receivers], positions[senders]
-    displacements = to - origin if box is None else box.displacement(to, origin)
+    senders = others[0] if others else receivers
+    pairs = pairs_by_receiver(receivers, senders, grid, include_self)
+    row_splits, receivers, senders = (torch.from_numpy(array).to(positions.device) for array in pairs)
+    displacements, distances = _separations(receivers_at, positions, row_splits, receivers, senders, box)
     return Edges(
         receivers=receivers,
         senders=senders,
         displacements=displacements,
-        distances=torch.linalg.vector_norm(displacements, dim=1),
+        distances=distances,
         row_splits=row_splits,
         num_senders=len(positions),
         cutoff=float(cutoff),
@@ -129,7 +141,17 @@ def half_list(positions: Tensor, cutoff: float, box: Box | None = None) -> np.nd
     """
     _check_points(positions, positions, box)
     _check_cutoff(cutoff, box)
-    return _tree(positions, box).query_pairs(cutoff, output_type="ndarray").reshape(-1, 2)
+    grid, cells = _sorted_in_cells([positions], cutoff, box)
+    return half_pairs(cells, grid)
+
+
+def _all_finite(values: Tensor) -> bool:
+    # A sum is far cheaper than asking each value, and is finite only if all are.
+    return math.isfinite(values.detach().sum().item()) or bool(torch.isfinite(values).all())
+
+
+def _all_below(indices: Tensor, count: int) -> bool:
+    return len(indices) == 0 or 0 <= int(indices.min()) <= int(indices.max()) < count
 
 
 def _check_points(positions: Tensor, queries: Tensor, box: Box | None) -> None:
@@ -138,7 +160,7 @@ def _check_points(positions: Tensor, queries: Tensor, box: Box | None) -> None:
             raise ShapeError(f"`{name}` must have shape (particles, dim) with dim 1 to 3, got {tuple(points.shape)}.")
         if not points.is_floating_point():
             raise ShapeError(f"`{name}` must be floating point, got {points.dtype}.")
-        if not torch.isfinite(points).all():
+        if not _all_finite(points):
             raise ShapeError(f"`{name}` must be finite, got NaN or infinity; look for a simulation that blew up.")
     check_shape("queries", queries.shape, ("queries", positions.shape[1]))
     if queries.dtype != positions.dtype or queries.device != positions.device:
@@ -162,26 +184,36 @@ def _check_cutoff(cutoff: float, box: Box | None) -> None:
             )
 
 
-def _tree(points: Tensor, box: Box | None) -> cKDTree:
-    coordinates = points.detach().cpu().double()
+def _sorted_in_cells(sets: Sequence[Tensor], cutoff: float, box: Box | None) -> tuple[CellGrid, *tuple[Cells, ...]]:
+    """Cells of the cutoff around the first of `sets` of points, and each of them sorted by these cells."""
+    arrays = [_from_corner(points.detach().cpu().double(), box).numpy() for points in sets]
+    grid = CellGrid.around(arrays[0], cutoff, _periodic_lengths(sets[0].shape[1], box))
+    return grid, *(grid.sort(points) for points in arrays)
+
+
+def _from_corner(points: Tensor, box: Box | None) -> Tensor:
+    """Points brought back into the box along periodic axes and counted from its lower corner, or as they are."""
     if box is None or not any(box.periodic):
-        return cKDTree(coordinates.numpy())
-    # SciPy takes periodic axes as [0, length) and a length of 0 for an open axis.
-    lower = torch.tensor(box.lower, dtype=torch.float64)
-    offset = (box.wrap(coordinates) - lower).numpy()
-    lengths = np.where(box.periodic, box.lengths, 0.0)
-    inside = np.where(np.array(box.periodic) & (offset >= box.lengths), 0.0, offset)
-    return cKDTree(inside, boxsize=lengths)
+        return points.contiguous()
+    offset = box.wrap(points) - torch.tensor(box.lower, dtype=torch.float64)
+    beyond = torch.tensor(box.periodic) & (offset >= torch.tensor(box.lengths, dtype=torch.float64))  # by rounding
+    return torch.where(beyond, 0.0, offset)
 
 
-def _pairs_within(tree: cKDTree, cutoff: float, include_self: bool) -> tuple[np.ndarray, np.ndarray]:
-    half = tree.query_pairs(cutoff, output_type="ndarray").astype(np.int64).reshape(-1, 2)
-    own = np.arange(tree.n if include_self else 0, dtype=np.int64)
-    return np.concatenate([half[:, 0], half[:, 1], own]), np.concatenate([half[:, 1], half[:, 0], own])
+def _periodic_lengths(dim: int, box: Box | None) -> np.ndarray:
+    return np.full(dim, np.inf) if box is None else np.where(box.periodic, box.lengths, np.inf)
 
 
-def _pairs_between(queries: cKDTree, points: cKDTree, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
-    if queries.n == 0 or points.n == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    pairs = queries.sparse_distance_matrix(points, cutoff, output_type="ndarray")
-    return pairs["i"].astype(np.int64), pairs["j"].astype(np.int64)
+def _separations(
+    to: Tensor, origin: Tensor, row_splits: Tensor, receivers: Tensor, senders: Tensor, box: Box | None
+) -> tuple[Tensor, Tensor]:
+    """Displacement and distance of each pair, by a compiled loop where nothing is to be differentiated."""
+    differentiated = torch.is_grad_enabled() and (to.requires_grad or origin.requires_grad)
+    if not differentiated and to.device.type == "cpu" and to.dtype in (torch.float32, torch.float64):
+        points = (points.detach().contiguous().numpy() for points in (to, origin))
+        lengths = _periodic_lengths(to.shape[1], box).astype(str(to.dtype).removeprefix("torch."))
+        found = separations(*points, row_splits.numpy(), senders.numpy(), lengths)
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
+    to, origin = to[receivers], origin[senders]
+    displacements = to - origin if box is None else box.displacement(to, origin)
+    return displacements, torch.linalg.vector_norm(displacements, dim=1)

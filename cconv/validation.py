@@ -16,6 +16,8 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+Value = bool | int | float | str  # of a hyperparameter
+
 Model = TypeVar("Model", bound=BaseModel)
 
 

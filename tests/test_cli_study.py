@@ -11,6 +11,7 @@ from conftest import SCRIPT, SMOKE
 from outcomes import assert_one_clear_line
 
 from cconv import load_model
+from cconv.study.records import RunFolder
 
 
 def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):
@@ -78,8 +79,12 @@ def test_bad_input_ends_in_one_line_and_leaves_no_run_folder(cconv, flow_folder,
     assert_one_clear_line(cconv(*run, "--data", tmp_path / "nowhere", *out), "nowhere", "does not exist")
     assert_one_clear_line(cconv(*run, *out), "data.path", "--data")
     assert_one_clear_line(cconv("study", "run", tmp_path / "no.toml", *out), "no.toml", "no such file")
-    typo = ("--set", "search.random_trial=3")
-    assert_one_clear_line(cconv(*run, "--data", flow_folder, *typo, *out), "search.random_trial", "random_trials")
+    typo = ("--set", "stages.random.trial=3")
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *typo, *out), "stages.random.trial", "trials")
+    missing = ("--set", 'stages.adaptive.space="refined"')
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *missing, *out), "`adaptive`", "`refined`", "'refine'")
+    late = ("--set", "search.grace_updates=600")
+    assert_one_clear_line(cconv(*run, "--data", flow_folder, *late, *out), "grace_updates (600) must not exceed")
     outside = ("--set", "network.kernel_size=0")
     assert_one_clear_line(cconv(*run, "--data", flow_folder, *outside, *out), "network.kernel_size", "got 0")
     nowhere = ("--set", "search.space=none.toml")
@@ -193,3 +198,43 @@ def test_ctrl_c_leaves_a_usable_checkpoint_of_a_training(flow_folder, tmp_path):
     assert "Interrupted" in error
     assert load_model(folder / "checkpoint").num_parameters > 0
     shutil.rmtree(folder)
+
+
+def test_a_second_run_on_the_same_folder_is_refused(cconv, finished_run):
+    before = (finished_run / "state.json").read_bytes()
+    with RunFolder(finished_run).locked():
+        assert_one_clear_line(cconv("study", "resume", finished_run), "another run works in this folder")
+        extend = ("study", "extend", finished_run, "--stage", "random", "--trials", "2")
+        assert_one_clear_line(cconv(*extend), "another run works in this folder")
+    assert (finished_run / "state.json").read_bytes() == before
+
+
+def test_only_a_search_can_be_extended(cconv, finished_run):
+    extend = ("study", "extend", finished_run, "--stage", "finalists", "--trials", "2")
+    assert_one_clear_line(cconv(*extend), "no search 'finalists' to extend", "random, adaptive")
+
+
+def test_a_finished_study_has_nothing_left_to_resume(cconv, finished_run):
+    before = (finished_run / "rungs.json").read_bytes()
+    status, out, _ = cconv("study", "resume", finished_run)
+    assert status == 0
+    assert "Study finished" in out
+    assert (finished_run / "rungs.json").read_bytes() == before
+
+
+def test_a_run_of_another_version_is_refused_and_left_alone(cconv, finished_run, tmp_path):
+    shutil.copytree(finished_run, tmp_path / "old")
+    study = json.loads((tmp_path / "old" / "study.json").read_text())
+    (tmp_path / "old" / "study.json").write_text(json.dumps(study | {"format": 1}))
+    for command in (("study", "status"), ("study", "resume"), ("report",)):
+        assert_one_clear_line(cconv(*command, tmp_path / "old"), "format 1", "run the study again")
+
+
+def test_a_space_whose_baseline_is_too_expensive_is_refused(cconv, flow_folder, tmp_path):
+    space = (SMOKE.parents[1] / "search_spaces" / "smoke.toml").read_text()
+    cap = next(line for line in space.splitlines() if line.startswith("max_flops_per_particle"))
+    (tmp_path / "space.toml").write_text(space.replace(cap, "max_flops_per_particle = 10"))
+    settings = ("--set", f"search.space={tmp_path / 'space.toml'}")
+    outcome = cconv("study", "run", SMOKE, "--data", flow_folder, *settings, "--out", tmp_path / "run")
+    assert_one_clear_line(outcome, "its baseline costs", "raise the cap")
+    assert not (tmp_path / "run").exists()

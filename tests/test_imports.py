@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "cconv"
 # A module may import from its own tier and from those before it.
 TIERS = [
     {"errors"},
-    {"domain", "neighbors", "validation"},
+    {"cell_list", "domain", "neighbors", "validation"},
     {"ops", "sph"},
     {"nn"},
     {"scenes", "data"},

@@ -1,13 +1,15 @@
 import itertools
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from oracles.brute_force_neighbors import brute_force_pairs
 
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
-from cconv.neighbors import radius_graph
+from cconv.neighbors import half_list, radius_graph
 
 LOWER, UPPER = (-0.5, 1.0, 0.2), (0.5, 2.5, 1.4)
 AXES = [axes for dim in (1, 2, 3) for axes in itertools.product([False, True], repeat=dim)]
@@ -233,6 +235,86 @@ def test_displacements_and_distances_are_differentiable(generator):
 
     assert len(geometry(positions, queries)[1]) > 5
     assert torch.autograd.gradcheck(geometry, (positions, queries))
+
+
+@over_axes
+def test_half_list_holds_each_pair_once(periodic, generator):
+    box = box_of(periodic)
+    positions = cloud(generator, 60, box, outside=0.3)
+    edges = radius_graph(positions, 0.4, box)
+    once = edges.receivers < edges.senders
+    expected = torch.stack([edges.receivers[once], edges.senders[once]], dim=1)
+    pairs = np.sort(half_list(positions, 0.4, box), axis=1)
+    assert sorted(map(tuple, pairs.tolist())) == sorted(map(tuple, expected.tolist()))
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_few_particles_far_from_the_others(dim, generator):
+    """Cells between and around them hold nothing, and cost nothing."""
+    positions = torch.rand(40, dim, dtype=torch.float64, generator=generator)
+    positions[3] += 1e6
+    positions[[5, 11]] -= 1e12
+    positions[17] = -1e300
+    edges = radius_graph(positions, 0.3)
+    assert assert_equals_brute_force(edges, positions, 0.3) > 10
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_groups_further_apart_than_cells_can_be_numbered(dim, generator):
+    groups = torch.randint(3, (60, 1), generator=generator) * 1e7
+    positions = groups + torch.rand(60, dim, dtype=torch.float64, generator=generator)
+    assert assert_equals_brute_force(radius_graph(positions, 0.5), positions, 0.5) > 10
+
+
+@over_axes
+def test_many_cells_and_many_particles_in_a_cell(periodic, generator):
+    """Cells of one particle and cells of a hundred, in one scene of some thirty cells along each axis."""
+    box = box_of(periodic)
+    positions = torch.cat([cloud(generator, 150, box), cloud(generator, 100, box) * 0.02 + torch.tensor(box.lower)])
+    assert assert_equals_brute_force(radius_graph(positions, 0.03, box), positions, 0.03, box) > 1000
+
+
+@over_axes
+def test_same_with_and_without_gradients(periodic, generator):
+    box = box_of(periodic)
+    for dtype in (torch.float32, torch.float64):
+        positions = cloud(generator, 50, box, outside=1.0).to(dtype)
+        plain, tracked = (radius_graph(at, 0.4, box) for at in (positions, positions.clone().requires_grad_()))
+        assert tracked.displacements.requires_grad
+        assert not plain.displacements.requires_grad
+        torch.testing.assert_close(tracked.displacements.detach(), plain.displacements, rtol=0, atol=0)
+        torch.testing.assert_close(tracked.distances.detach(), plain.distances)
+
+
+def test_points_in_any_memory_layout(generator):
+    positions = torch.rand(3, 80, dtype=torch.float64, generator=generator).T
+    torch.testing.assert_close(
+        radius_graph(positions, 0.4).displacements, radius_graph(positions.contiguous(), 0.4).displacements
+    )
+
+
+def test_half_precision_finds_the_pairs_of_its_positions(generator):
+    positions = torch.rand(80, 3, generator=generator).half()
+    edges = radius_graph(positions, 0.4)
+    assert edges.distances.dtype == edges.displacements.dtype == torch.float16
+    assert torch.equal(edges.senders, radius_graph(positions.double(), 0.4).senders)
+
+
+def test_pairs_that_do_not_fit_are_refused(generator):
+    edges = radius_graph(torch.rand(30, 2, generator=generator), 0.3)
+    edges.check()
+    for changes in (
+        {"receivers": edges.receivers + 30},
+        {"senders": edges.senders - 1},
+        {"row_splits": edges.row_splits.flip(0)},
+        {"row_splits": edges.row_splits[:-1]},
+    ):
+        with pytest.raises(ShapeError, match="`edges` must list pairs among .* build them with `radius_graph`"):
+            replace(edges, **changes).check()
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ShapeError, match="`edges` must have finite displacements"):
+            replace(edges, displacements=edges.displacements * bad).check()
+    replace(edges, displacements=edges.displacements * 1e38).check()  # whose sum may not be finite
 
 
 @pytest.mark.parametrize("name", ["positions", "queries"])

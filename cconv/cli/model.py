@@ -37,7 +37,7 @@ def train(
             )  # fmt: skip
             entries = list(trial)
     except CConvError:
-        shutil.rmtree(out)
+        shutil.rmtree(out, ignore_errors=True)
         raise
     except KeyboardInterrupt:
         folder.finish("interrupted")

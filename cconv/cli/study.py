@@ -1,7 +1,7 @@
-"""`cconv study`: run a study and look at its state."""
+"""`cconv study`: run a study, go on with it, give it more trials, look at its state."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -9,6 +9,9 @@ from rich.table import Table
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import StudyDisplay
 from cconv.errors import CConvError
+
+if TYPE_CHECKING:
+    from cconv.study.records import RunFolder
 
 # Commands import what they run inside, as torch and ray take seconds to load and `--help` should not.
 
@@ -31,6 +34,26 @@ Settings = Annotated[
 ]
 
 
+Address = Annotated[
+    str | None,
+    typer.Option(
+        "--address",
+        metavar="HOST:PORT",
+        help="Train on the Ray cluster there ('auto' for one on this machine); the run folder must be on storage that "
+        "all nodes share. Without it a private Ray uses the cores of this machine.",
+    ),
+]
+Storage = Annotated[
+    str | None,
+    typer.Option(
+        "--storage",
+        metavar="URL",
+        help="Database of the Optuna study, e.g. postgresql+psycopg://USER@HOST/DATABASE; without it a journal file in "
+        "the run folder.",
+    ),
+]
+
+
 @app.command()
 def run(
     study: StudyFile,
@@ -39,18 +62,19 @@ def run(
         Path | None, typer.Option("--out", metavar="DIR", help="Run folder to write; runs/<study> if not given.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
+    address: Address = None,
+    storage: Storage = None,
     settings: Settings = None,
 ) -> None:
-    """Run a whole study: closed forms, random search, adaptive search, finalists, report.
+    """Run a whole study: the stages that its file declares, then the report.
 
-    Single linear layers are solved by least squares first, if the study file asks for it. Trials then run at once on
-    all cores, one core each, and stop early by ASHA. The most accurate configurations and the baseline are retrained
-    with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn. Ctrl-C stops cleanly: what was
-    recorded stays readable (`cconv study status`, `cconv report`).
+    Trials run at once on all cores, one core each, and stop early by ASHA. The best configurations and the baseline are
+    retrained with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn. Ctrl-C stops cleanly:
+    what was recorded stays readable (`cconv study status`, `cconv report`), and `cconv study resume` goes on, also
+    after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
-    from cconv.report.page import write_report
     from cconv.study.config import load_study
-    from cconv.study.pipeline import run_study
+    from cconv.study.pipeline import begin_study
     from cconv.study.problem import open_study_data, with_data_path
     from cconv.study.records import RunFolder
     from cconv.study.space import load_space
@@ -61,22 +85,69 @@ def run(
     space = load_space(config.search.space)
     open_study_data(config.data, config.seeds.data)
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
+    begin_study(config, space, folder)
     try:
-        with StudyDisplay(errors) as display:
-            summary = run_study(config, space, folder, display, show_progress)
-    except KeyboardInterrupt:
-        errors.print(f"\nInterrupted; everything recorded so far is in {folder.path}.", soft_wrap=True)
-        raise
+        _run_stages(folder, address, storage)
     except CConvError:
         if not folder.trials():
             folder.remove()  # nothing was learned, and the same command shall work once the input is mended
         raise
-    finally:
-        if folder.path.exists():
-            report = write_report(folder)
-    results.print(_finalists_table(summary))
-    results.print(summary["recommended"]["reason"], highlight=False)
-    results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes. Report: {report}", soft_wrap=True)
+
+
+@app.command()
+def resume(path: RunPath, data: DataPath = None, address: Address = None, storage: Storage = None) -> None:
+    """Go on with a study that was interrupted or killed, at most one evaluation interval of each trial behind.
+
+    Stages that came to their end are kept, trials that ended too; others go on from their last evaluation, and the
+    rungs of ASHA are those that they were.
+    """
+    from cconv.study.pipeline import move_data
+    from cconv.study.records import RunFolder
+
+    folder = RunFolder.open(path)
+    if data is not None:
+        move_data(folder, data)
+    _run_stages(folder, address, storage)
+
+
+@app.command()
+def extend(
+    path: RunPath,
+    stage: Annotated[str, typer.Option("--stage", help="Search to extend, by its name in the study file.")],
+    trials: Annotated[int, typer.Option("--trials", min=1, help="How many trials to add.")],
+    address: Address = None,
+    storage: Storage = None,
+) -> None:
+    """Give a search of a study more trials, and run the stages that read it again on what is trained already."""
+    from cconv.study.pipeline import extend_study
+    from cconv.study.records import RunFolder
+
+    folder = RunFolder.open(path)
+    extend_study(folder, stage, trials)
+    _run_stages(folder, address, storage)
+
+
+def _run_stages(folder: "RunFolder", address: str | None, storage: str | None) -> None:
+    """Run what is left of a study, write its report and print its answer."""
+    from cconv.report.page import write_report
+    from cconv.study.pipeline import run_study
+
+    with StudyDisplay(errors) as display:
+        try:
+            summary = run_study(folder, display, show_progress, address=address, storage=storage)
+        except KeyboardInterrupt:
+            write_report(folder)
+            errors.print(
+                f"\nInterrupted; everything so far is in {folder.path}. Go on with: cconv study resume {folder.path}",
+                soft_wrap=True,
+            )
+            raise
+    report = write_report(folder)
+    if summary is not None:
+        results.print(_finalists_table(summary))
+        results.print(summary["recommended"]["reason"], highlight=False)
+        results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes.", highlight=False)
+    results.print(f"Report: {report}", soft_wrap=True)
 
 
 @app.command()
@@ -84,8 +155,7 @@ def status(
     path: RunPath, as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False
 ) -> None:
     """Show how far a study has come: its state, its trials by outcome, the best so far."""
-    from cconv.study.pipeline import count_outcomes
-    from cconv.study.records import RunFolder
+    from cconv.study.records import RunFolder, count_outcomes
 
     folder = RunFolder.open(path)
     records = folder.trials()

@@ -18,7 +18,7 @@ class Inputs:
 
     Attributes:
         positions: Fluid positions (N, D), length.
-        features: [1, v, ρ] of each fluid particle, (N, D + 2), in the units of the data.
+        features: [1, v, ρ] of each fluid particle, (N, D + 2), or [1, v], (N, D + 1), in the units of the data.
         boundary_positions: (B, D), or None where the scene has no boundary.
         boundary_features: Normals (B, D), or ones (B, 1) where the data hold none; None without boundary.
         box: Bounds and periodic axes.
@@ -62,9 +62,7 @@ class FluidState:
 
 def fluid_state(frame: Frame, box: Box, kernel) -> FluidState:
     """Fluid particles of `frame` with density by summation over fluid particles only, as in the thesis."""
-    fluid = frame.particle_types == ParticleType.FLUID
-    positions, velocities = frame.positions[fluid].double(), frame.velocities[fluid].double()
-    masses = frame.masses[fluid].double()
+    positions, velocities, masses = _fluid_particles(frame)
     edges = radius_graph(positions, kernel.support_radius, box)
     return FluidState(
         positions=positions,
@@ -75,13 +73,27 @@ def fluid_state(frame: Frame, box: Box, kernel) -> FluidState:
     )
 
 
+def _fluid_particles(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions, velocities and masses of the fluid particles in float64."""
+    fluid = frame.particle_types == ParticleType.FLUID
+    return frame.positions[fluid].double(), frame.velocities[fluid].double(), frame.masses[fluid].double()
+
+
 def make_inputs(state: FluidState, boundary: Boundary | None, box: Box) -> Inputs:
     """Network inputs in float32: features [1, v, ρ] (thesis section 3.1), boundary features = normals."""
-    ones = torch.ones_like(state.densities)[:, None]
-    features = torch.cat([ones, state.velocities, state.densities[:, None]], dim=1)
+    return _inputs(state.positions, [state.velocities, state.densities[:, None]], boundary, box)
+
+
+def inputs_without_density(frame: Frame, box: Box) -> Inputs:
+    """Network inputs in float32 without density, so that no sum over neighbours is taken: features [1, v]."""
+    positions, velocities, _ = _fluid_particles(frame)
+    return _inputs(positions, [velocities], frame.boundary, box)
+
+
+def _inputs(positions: Tensor, features: list[Tensor], boundary: Boundary | None, box: Box) -> Inputs:
     return Inputs(
-        positions=state.positions.float(),
-        features=features.float(),
+        positions=positions.float(),
+        features=torch.cat([torch.ones_like(positions[:, :1]), *features], dim=1).float(),
         boundary_positions=None if boundary is None else boundary.positions.float(),
         boundary_features=None if boundary is None else _boundary_features(boundary),
         box=box,
@@ -105,6 +117,10 @@ class Standardization:
 
     mean: Tensor
     scale: Tensor
+
+    def first(self, channels: int) -> "Standardization":
+        """Standardisation of the first `channels` values alone."""
+        return Standardization(self.mean[:channels], self.scale[:channels])
 
 
 def standardize_features(features: Iterable[Tensor], center_velocity: bool = True) -> Standardization:

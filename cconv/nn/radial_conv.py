@@ -14,6 +14,10 @@ These are all contributions that are linear in one message: see Villar et al., "
 machine learning, structured like classical physics" (NeurIPS 2021).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+
 import torch
 from torch import Tensor, nn
 
@@ -21,13 +25,13 @@ from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
 from cconv.neighbors import Edges
 from cconv.nn.continuous_conv import (
     MESSAGES,
-    check_edges,
     check_finite,
     check_kind,
     importance,
     uniform_filters,
 )
-from cconv.nn.filters import interpolate
+from cconv.nn.filters import WINDOWS, interpolate
+from cconv.ops import radial
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
 
@@ -61,13 +65,12 @@ class RadialGeometry:
         detach_positions: Whether to hold positions constant.
 
     Attributes:
+        edges: As given.
         num_terms: As given.
         bipartite: Whether receivers and senders are different points.
         receivers: Receiver i of each edge, (E,).
         senders: Sender j of each edge, (E,).
         num_senders: Number of points that could send.
-        directions: (x_j - x_i) / r, (E, D); 0 where two points coincide.
-        reads: Terms of each edge, which counts as a sender of its own.
 
     Raises:
         ConfigError: If the window is unknown or there is no term.
@@ -82,43 +85,71 @@ class RadialGeometry:
         normalize: bool = False,
         detach_positions: bool = False,
     ):
-        check_edges(edges)
+        edges.check()
+        check_choice("window", window, WINDOWS)
         if not (isinstance(num_terms, int) and num_terms >= 1):
             raise ConfigError(f"`num_terms` must be a positive whole number, got {num_terms!r}.")
-        self.num_terms = num_terms
+        self.edges, self.num_terms = edges, num_terms
         self.bipartite = edges.bipartite
         self.receivers, self.senders, self.num_senders = edges.receivers, edges.senders, edges.num_senders
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not detach_positions):
-            apart = torch.where(edges.distances > 0, edges.distances, 1.0)
-            self.directions = -edges.displacements / apart[:, None]
-            place = (edges.distances / edges.cutoff)[:, None] * (num_terms - 1)
-            lowest, fractions, _ = interpolate(place, (num_terms,), "linear")
-            self.reads = FilterReads(
+        self._window, self._normalize = window, normalize
+        self._differentiates = torch.is_grad_enabled() and not detach_positions
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions D."""
+        return self.edges.dim
+
+    @property
+    def num_receivers(self) -> int:
+        """Number of receiving points."""
+        return self.edges.num_receivers
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes, also of what convolutions add on first use."""
+        held = (self.senders, self.edges.displacements, self.edges.distances, self.directions)
+        return self.reads.nbytes + sum(tensor.nbytes for tensor in held)
+
+    @cached_property
+    def directions(self) -> Tensor:
+        """(x_j - x_i) / r, (E, D); 0 where two points coincide."""
+        with self._gradients():
+            apart = torch.where(self.edges.distances > 0, self.edges.distances, 1.0)
+            return -self.edges.displacements / apart[:, None]
+
+    @cached_property
+    def weights(self) -> Tensor | None:
+        """Window of each edge (E,), divided by ψ if normalised; None where all weigh 1."""
+        if self._window == "none" and not self._normalize:
+            return None
+        with self._gradients():
+            return importance(self.edges, self._window, self._normalize)
+
+    @cached_property
+    def reads(self) -> FilterReads:
+        """Terms of each edge, which counts as a sender of its own."""
+        edges, terms = self.edges, self.num_terms
+        with self._gradients():
+            place = (edges.distances / edges.cutoff)[:, None] * (terms - 1)
+            lowest, fractions, ones = interpolate(place, (terms,), "linear")
+            return FilterReads(
                 row_splits=edges.row_splits,
                 receivers=edges.receivers,
                 senders=torch.arange(len(edges), device=edges.senders.device),
                 cells=lowest[:, 0].contiguous(),
                 fractions=fractions,
-                weights=importance(edges, window, normalize),
-                corner_offsets=torch.tensor([0, min(1, num_terms - 1)], dtype=torch.int32),
-                num_cells=num_terms,
+                weights=ones if self.weights is None else self.weights,
+                corner_offsets=torch.tensor([0, min(1, terms - 1)], dtype=torch.int32),
+                num_cells=terms,
                 num_senders=len(edges),
             )
 
-    @property
-    def dim(self) -> int:
-        """Number of space dimensions D."""
-        return self.directions.shape[1]
-
-    @property
-    def num_receivers(self) -> int:
-        """Number of receiving points."""
-        return self.reads.num_receivers
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes, also of what convolutions add on first use."""
-        return self.reads.nbytes + self.senders.nbytes + self.directions.nbytes
+    @contextmanager
+    def _gradients(self) -> Iterator[None]:
+        """As when the geometry was made, whatever the mode in which a part of it is first asked for."""
+        with torch.inference_mode(False), torch.set_grad_enabled(self._differentiates):
+            yield
 
     def messages(self, features: Tensor, channels: Channels, message: str) -> tuple[Tensor, Tensor]:
         """What each edge contributes before the radial terms.
@@ -185,10 +216,19 @@ class RadialConv(nn.Module):
 
     def convolve(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
         """`forward` without its checks, for hidden layers."""
+        filters = self.scalar_filters, self.vector_filters
+        if radial.applies(features, *filters, geometry.edges):
+            output = radial.convolve(features, *filters, geometry.edges, geometry.weights, MESSAGES[self.message])
+        else:
+            output = self._convolve_generally(features, geometry)
+        if self.bias is None:
+            return output
+        return torch.cat([output[:, : len(self.bias)] + self.bias, output[:, len(self.bias) :]], dim=1)
+
+    def _convolve_generally(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
+        """Any device and dtype, differentiable: convolutions of what each edge sends."""
         to_scalars, to_vectors = geometry.messages(features, self.in_channels, self.message)
         scalars = convolve(to_scalars, self.scalar_filters, geometry.reads)
-        if self.bias is not None:
-            scalars = scalars + self.bias
         if self.out_channels[1] == 0:
             return scalars
         vectors = [convolve(component, self.vector_filters, geometry.reads) for component in to_vectors]
@@ -203,4 +243,4 @@ class RadialConv(nn.Module):
                 f"{geometry.num_terms} in {geometry.dim}."
             )
         check_shape("features", features.shape, (geometry.num_senders, num_values(self.in_channels, self.dim)))
-        check_kind(geometry.reads.weights, features=features, filters=self.scalar_filters)
+        check_kind(geometry.edges.distances, features=features, filters=self.scalar_filters)

@@ -3,15 +3,36 @@
 import base64
 import io
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
-from cconv.report.plots import best_so_far_chart, learning_curves_chart, speed_accuracy_chart
-from cconv.report.tables import curves_table, finalists_table, stability_rows, trials_table
+from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
+from cconv.report.importance_plots import importance_chart, partial_dependence_chart
+from cconv.report.interactive import interactive_html
+from cconv.report.plots import (
+    ablation_chart,
+    best_so_far_chart,
+    growth_chart,
+    learning_curves_chart,
+    rung_audit_chart,
+    strategies_chart,
+)
+from cconv.report.tables import curves_table, finalists_table, trials_table
+from cconv.report.verdicts import verdict_matrix
 from cconv.study.records import RunFolder
+
+# Figures of what a summary may hold, by the key that it holds it under.
+_CHARTS: dict[str, Callable[[Mapping], Figure]] = {
+    "growth": growth_chart,
+    "references": strategies_chart,
+    "rung_audit": rung_audit_chart,
+    "importance": lambda summary: importance_chart(summary["importance"]),
+    "partial_dependence": lambda summary: partial_dependence_chart(summary["partial_dependence"]),
+}
 
 
 def write_report(run: RunFolder) -> Path:
@@ -28,29 +49,47 @@ def write_report(run: RunFolder) -> Path:
 
 
 def render_report(run: RunFolder) -> str:
-    """HTML of the report, pictures included."""
-    environment = Environment(loader=PackageLoader("cconv.report"), autoescape=select_autoescape())
-    finished = (run.path / "summary.json").is_file()
-    summary = run.read("summary.json") if finished else None
-    trials, curves = trials_table(run), curves_table(run)
-    searched = not trials.empty and bool(trials["valid_normalized_mse"].notna().any())
+    """HTML of the report, charts included."""
+    environment = Environment(
+        loader=PackageLoader("cconv.report"), autoescape=select_autoescape(["html.j2"]), trim_blocks=True
+    )
+    environment.filters |= {"number": _number, "duration": _duration}
+    summary = _read_if_there(run, "summary.json")
     return environment.get_template("report.html.j2").render(
         study=run.read("study.json"),
         space=run.read("space.json"),
         state=run.read("state.json"),
-        environment=run.read("environment.json") if (run.path / "environment.json").is_file() else None,
+        environment=_read_if_there(run, "environment.json"),
         summary=summary,
-        comparison=_comparison(summary) if finished else None,
-        front_chart=_picture(speed_accuracy_chart(summary)) if finished else None,
-        curves_chart=_picture(learning_curves_chart(curves)) if searched else None,
-        search_chart=_picture(best_so_far_chart(trials)) if searched else None,
-        finalists=_finalists_rows(summary) if finished else [],
-        stability=stability_rows(summary) if finished else [],
-        trials=_html(trials.sort_values("valid_normalized_mse")) if not trials.empty else "",
+        **_search_parts(run),
+        **(_finished_parts(run, summary) if summary else {}),
     )
 
 
-def _comparison(summary: dict) -> dict:
+def _search_parts(run: RunFolder) -> dict:
+    """What the trials show, also of a run that is not finished."""
+    trials, curves = trials_table(run), curves_table(run)
+    searched = not trials.empty and bool(trials["valid_normalized_mse"].notna().any())
+    return {
+        "curves_chart": _picture(learning_curves_chart(curves)) if searched else None,
+        "search_chart": _picture(best_so_far_chart(trials)) if searched else None,
+        "trials": "" if trials.empty else _html(trials.sort_values("valid_normalized_mse")),
+    }
+
+
+def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
+    return {
+        "comparison": _comparison(summary),
+        "chart": interactive_html(summary),
+        "charts": {name: _picture(draw(summary)) for name, draw in _CHARTS.items() if summary.get(name)}
+        | ({"ablation": _picture(ablation_chart(summary))} if summary.get("ablation", {}).get("path") else {}),
+        "finalists": _finalists_rows(summary),
+        "stability": verdict_matrix(summary),
+        "explained": _explained(run, summary),
+    }
+
+
+def _comparison(summary: Mapping) -> dict:
     """The recommended model beside the baseline, as ratios where the baseline finished."""
     entries = {entry["id"]: entry for entry in summary["finalists"]}
     baseline, chosen = entries.get(summary["baseline"]), entries[summary["recommended"]["id"]]
@@ -65,11 +104,54 @@ def _comparison(summary: dict) -> dict:
     }
 
 
-def _finalists_rows(summary: dict) -> list[dict]:
+def _finalists_rows(summary: Mapping) -> list[dict]:
+    """Rows of the tables of finalists, most accurate first; each with its whole entry in the summary."""
     front = set(summary["pareto_front"])
+    entries = {entry["id"]: entry for entry in summary["finalists"]}
     rows = finalists_table(summary).to_dict("records")
-    hyperparameters = {entry["id"]: entry["config"]["parameters"] for entry in summary["finalists"]}
-    return [row | {"on_front": row["model"] in front, "settings": hyperparameters[row["model"]]} for row in rows]
+    return [row | {"on_front": row["model"] in front, "entry": entries[row["model"]]} for row in rows]
+
+
+def _explained(run: RunFolder, summary: Mapping) -> dict | None:
+    """Charts of what the recommended model and the baseline have learned, where they were explained."""
+    explanations = read_explanations(run)
+    best, baseline = summary["recommended"]["id"], summary["baseline"]
+    names = [name for name in dict.fromkeys((best, baseline)) if name in explanations]
+    if not names:
+        return None
+    return {
+        "distribution": _picture(error_distribution_chart(explanations, baseline, best)),
+        "models": {
+            name: {
+                "filters": _picture(filters_chart(explanations[name])),
+                "fields": _picture(fields_chart(explanations[name])),
+                "unexplained": float(explanations[name]["unexplained"]),
+                "is_combined": bool(explanations[name]["is_combined"]),
+            }
+            for name in names
+        },
+    }
+
+
+def _read_if_there(run: RunFolder, name: str) -> dict | None:
+    return run.read(name) if (run.path / name).is_file() else None
+
+
+def _number(value: float | int | bool | str | None, digits: int = 3) -> str:
+    """A value for a reader: whole numbers in full, others with so many digits, "–" for none."""
+    if value is None or value != value:  # nan
+        return "–"
+    if isinstance(value, bool | str):
+        return {True: "yes", False: "no"}.get(value, str(value))
+    return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}g}"
+
+
+def _duration(seconds: float) -> str:
+    """Seconds in the unit that a reader expects."""
+    for unit, length in (("hours", 3600), ("minutes", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.3g} seconds"
 
 
 def _html(table: pd.DataFrame) -> str:
@@ -78,5 +160,5 @@ def _html(table: pd.DataFrame) -> str:
 
 def _picture(figure: Figure) -> str:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
+    figure.savefig(buffer, format="png", dpi=110)
     return base64.b64encode(buffer.getvalue()).decode()

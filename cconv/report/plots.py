@@ -7,87 +7,39 @@ import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cconv.report.tables import finalists_table
+from cconv.report.colors import MARKED, stage_colors
+from cconv.report.tables import AUDIT_MEASURES, growth_table, rung_audit_table, strategies_table
+from cconv.report.verdicts import verdict_matrix
 
-_BASELINE, _FINALIST, _RECOMMENDED = "#c44e52", "#4c72b0", "#55a868"
-_STAGES = {"closed_form": "#8172b3", "initialization": "0.6", "random": "#4c72b0", "adaptive": "#dd8452"}
-
-
-def speed_accuracy_chart(summary: Mapping) -> Figure:
-    """Test error against time per frame, log axes; baseline marked, front drawn.
-
-    Vertical bars are 95 % intervals over seeds and test units, horizontal bars the quartiles of the timing.
-    """
-    table = finalists_table(summary).set_index("model")
-    recommended = summary["recommended"]["id"]
-    figure, axes = _figure(7.5, 5)
-    for number, (name, row) in enumerate(table.iterrows()):
-        color = {summary["baseline"]: _BASELINE, recommended: _RECOMMENDED}.get(name, _FINALIST)
-        error, ms = row["normalized_mse"], row["ms_per_frame"]
-        axes.errorbar(
-            ms,
-            error,
-            xerr=[[max(ms - row["ms_low"], 0)], [max(row["ms_high"] - ms, 0)]],
-            yerr=[[max(error - row["ci95_low"], 0)], [max(row["ci95_high"] - error, 0)]],
-            fmt="s" if name == summary["baseline"] else "*" if name == recommended else "o",
-            markersize=15 if name == recommended else 9,
-            color=color,
-            capsize=3,
-            zorder=3,
-        )
-        label = f"{name} (recommended)" if name == recommended else name
-        axes.annotate(
-            f"{label}\n{row['num_parameters']:,.0f} parameters",
-            (ms, error),
-            xytext=(10, 6) if number % 2 == 0 else (10, -24),
-            textcoords="offset points",
-            fontsize=8,
-            color=color,
-        )
-    front = table.loc[summary["pareto_front"]]
-    axes.step(front["ms_per_frame"], front["normalized_mse"], where="post", color="0.6", zorder=1, label="front")
-    axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel="test error (normalized MSE)")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:g}")
-    axes.margins(x=0.35, y=0.25)
-    threads = summary["finalists"][0]["cost"]["threads"]
-    axes.set_title(f"{summary['study']}: error against cost ({threads} thread{'s' if threads > 1 else ''})")
-    axes.legend(loc="best")
-    return figure
+_ERROR = "validation error (normalized MSE)"
 
 
 def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> Figure:
     """Validation error against gradient updates, one line a search trial, and one for each retraining beside them."""
-    figure, (search, finals) = _figure(11, 4.2, columns=2)
+    figure, (search, finals) = new_figure(11, 4.2, columns=2)
     trials, retrained = curves[curves["stage"] != "finalists"], curves[curves["stage"] == "finalists"]
+    stages = stage_colors(list(trials["stage"].unique()))
     for (_, stage), curve in trials.groupby(["name", "stage"]):
-        search.plot(
-            curve["updates"],
-            curve["valid_normalized_mse"],
-            color=_STAGES.get(stage, "0.5"),
-            alpha=0.6,
-            marker=".",
-            lw=1,
-        )
-    for stage, color in _STAGES.items():
-        if stage in set(trials["stage"]):
-            search.plot([], [], color=color, label=f"{stage} search")
+        style = {"color": stages[stage], "alpha": 0.6, "marker": ".", "lw": 1}
+        search.plot(curve["updates"], curve["valid_normalized_mse"], **style)
+    for stage, color in stages.items():
+        search.plot([], [], color=color, label=stage)
     challengers = sorted(set(retrained["name"]) - {baseline})
-    colors = {baseline: _BASELINE} | dict(zip(challengers, sns.color_palette("deep", len(challengers)), strict=True))
+    palette = sns.color_palette("husl", len(challengers))
+    colors = {baseline: MARKED["baseline"]} | dict(zip(challengers, palette, strict=True))
     for name, lines in retrained.groupby("name"):
         for number, (_, curve) in enumerate(lines.groupby("seed")):
             style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
-            finals.plot(curve["updates"], curve["valid_normalized_mse"], **style)
+            finals.plot(curve["updates"], curve["valid_normalized_mse"], marker="." if len(curve) == 1 else "", **style)
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
-        axes.set(yscale="log", xlabel="gradient updates", ylabel="validation error (normalized MSE)", title=title)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8)
+        axes.set(yscale="log", xlabel="gradient updates", ylabel=_ERROR, title=title)
+        _legend(axes)
     return figure
 
 
 def best_so_far_chart(trials: pd.DataFrame) -> Figure:
     """Smallest validation error found against trials begun, and each trial's error by outcome."""
-    figure, axes = _figure(7.5, 4)
+    figure, axes = new_figure(7.5, 4)
     order = range(1, len(trials) + 1)
     sns.scatterplot(
         x=list(order), y=trials["valid_normalized_mse"], hue=trials["outcome"], style=trials["stage"], ax=axes, zorder=3
@@ -99,7 +51,100 @@ def best_so_far_chart(trials: pd.DataFrame) -> Figure:
     return figure
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Axes]:
+def strategies_chart(summary: Mapping) -> Figure:
+    """Smallest validation error against gradient updates spent, one line a search strategy."""
+    figure, axes = new_figure(7.5, 4)
+    for name, curve in strategies_table(summary).groupby("strategy", sort=False):
+        axes.step(curve["updates"], curve["error"], where="post", marker=".", label=name)
+    axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_ERROR, title="best so far, by strategy")
+    _legend(axes)
+    return figure
+
+
+def rung_audit_chart(summary: Mapping) -> Figure:
+    """What the order of the trials at each rung says of the order at the full budget, with 95 % intervals.
+
+    A rung that too few trials reached to be measured has no point.
+    """
+    table = rung_audit_table(summary)
+    figure, panels = new_figure(10, 3.3, columns=len(AUDIT_MEASURES))
+    for axes, name in zip(panels, AUDIT_MEASURES, strict=True):
+        value, low, high = (table[column].astype(float) for column in (name, f"{name}_low", f"{name}_high"))
+        bars = [(value - low).clip(lower=0), (high - value).clip(lower=0)]
+        axes.errorbar(table["updates"], value, yerr=bars, marker="o", capsize=3)
+        axes.set(xscale="log", xlabel="updates at the rung", title=AUDIT_MEASURES[name])
+        axes.set_xticks(table["updates"], table["updates"], minor=False)
+        axes.minorticks_off()
+    return figure
+
+
+def growth_chart(summary: Mapping) -> Figure:
+    """Time per frame against the number of particles, log axes, one line a model; bands are quartiles."""
+    figure, axes = new_figure(7.5, 4.2)
+    exponents = summary["growth"].get("exponents", {})
+    for name, times in growth_table(summary).groupby("model", sort=False):
+        label = f"{name}: ∝ N^{exponents[name]:.2f}" if name in exponents else name
+        (line,) = axes.plot(times["num_particles"], times["ms_per_frame"], marker="o", label=label)
+        band = {"color": line.get_color(), "alpha": 0.2, "lw": 0}
+        axes.fill_between(times["num_particles"], times["ms_low"], times["ms_high"], **band)
+    axes.set(xscale="log", yscale="log", xlabel="particles N", ylabel="time per frame [ms]", title="growth of the cost")
+    _legend(axes)
+    return figure
+
+
+def cost_chart(summary: Mapping) -> Figure:
+    """Time per frame of each finalist, geometry and network apart, fastest first."""
+    costs = {entry["id"]: entry["cost"] for entry in summary["finalists"]}
+    names = sorted(costs, key=lambda name: costs[name]["ms_per_frame"])
+    figure, axes = new_figure(8, 1.4 + 0.36 * len(names))
+    geometry, network = ([costs[name][part] for name in names] for part in ("geometry_ms", "network_ms"))
+    axes.barh(names, geometry, color="0.7", label="geometry")
+    axes.barh(names, network, left=geometry, color=MARKED["finalist"], label="network")
+    axes.invert_yaxis()
+    axes.set(xlabel="time per frame [ms]", title="where the time goes")
+    _legend(axes)
+    return figure
+
+
+def stability_chart(summary: Mapping) -> Figure:
+    """Each check of stability by its limit, log axis: left of the line at 1 a finalist passes."""
+    checks = [check for check in verdict_matrix(summary) if check.limit is not None]
+    names = [entry["id"] for entry in summary["finalists"]]
+    figure, axes = new_figure(9, 1.6 + 0.3 * len(checks))
+    for number, name in enumerate(names):
+        places = [place for place, check in enumerate(checks) if check.cells[number].value is not None]
+        ratios = [checks[place].cells[number].value / checks[place].limit for place in places]
+        axes.plot(ratios, places, "o", alpha=0.8, label=name)
+    axes.axvline(1, color=MARKED["baseline"], lw=1.2)
+    axes.set_yticks(range(len(checks)), [check.label for check in checks])
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="measured by limit", title="checks of stability")
+    _legend(axes)
+    return figure
+
+
+def ablation_chart(summary: Mapping) -> Figure:
+    """Validation error on the way from the baseline to the best, one change after the other, each retrained."""
+    path = pd.DataFrame(summary["ablation"]["path"]).astype(
+        {"valid_normalized_mse": float, "low": float, "high": float}
+    )
+    figure, axes = new_figure(8, 1.2 + 0.38 * len(path))
+    error, low, high = (path[name].astype(float) for name in ("valid_normalized_mse", "low", "high"))
+    places, bars = range(len(path)), [(error - low).clip(lower=0), (high - error).clip(lower=0)]
+    axes.errorbar(error, places, xerr=bars, fmt="o-", capsize=3, color=MARKED["finalist"])
+    axes.set_yticks(places, [str(change) for change in path["change"]])
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel=_ERROR, title="from the baseline to the best")
+    return figure
+
+
+def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Axes]:
+    """An empty figure in the style of the report, width and height in inches, with its axes side by side."""
     with sns.axes_style("whitegrid"):
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.subplots(1, columns)
+
+
+def _legend(axes: Axes) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)

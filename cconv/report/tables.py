@@ -6,6 +6,9 @@ import pandas as pd
 
 from cconv.study.records import RunFolder
 
+ANALYTIC = "analytic SPH"
+AUDIT_MEASURES = {"spearman": "rank correlation", "recall": "recall of the best", "regret": "regret"}
+
 
 def trials_table(run: RunFolder) -> pd.DataFrame:
     """One row a search trial: stage, outcome, updates, last validation error, seconds, parameters, hyperparameters."""
@@ -69,25 +72,93 @@ def finalists_table(summary: Mapping) -> pd.DataFrame:
     return pd.DataFrame(rows).sort_values("normalized_mse", ignore_index=True)
 
 
-def stability_rows(summary: Mapping) -> list[tuple[str, list[str]]]:
-    """One row a check of stability, with a cell for each finalist; none for a run that measured no stability."""
-    checks = [entry["stability"] for entry in summary["finalists"]]
-    if not all(checks):
-        return []
-    first = checks[0]
-    rows = [("passes every check", ["yes" if check["stable"] else "no" for check in checks])]
-    for regime, values in first["regimes"].items():
-        label = f"regime {regime.replace('_', ' ')} ({100 * values['share']:.0f} % of the particles)"
-        rows.append((label, [f"{check['regimes'][regime]['normalized_mse']:.3g}" for check in checks]))
-    for frame in first["stress"]:
-        errors = [check["stress"][frame] for check in checks]
-        label = f"frame {frame.replace('_', ' ')}"
-        rows.append((label, ["–" if error is None else f"{error:.3g}" for error in errors]))
-    rows.append(("float32 from float64", [f"{check['precision']:.2g}" for check in checks]))
-    if first["density_rollout"]:
-        rollouts = [check["density_rollout"] for check in checks]
-        rows.append(("integrated density, deviation", [f"{rollout['largest']:.3g}" for rollout in rollouts]))
-        outside = [rollout["first_frame_outside"] for rollout in rollouts]
-        label = f"first frame outside, of {rollouts[0]['frames']}"
-        rows.append((label, ["never" if frame is None else str(frame) for frame in outside]))
-    return rows
+def speed_accuracy_table(summary: Mapping) -> pd.DataFrame:
+    """One row a point of the speed-accuracy chart.
+
+    Columns: name; kind ("finalist", "search" or "analytic"); group, the stage of a search point or what marks a
+    finalist ("recommended", "baseline", "thesis's best", "finalist"); error, error_low, error_high (of the test split
+    for finalists, of the validation split for search points, 0 for analytic SPH); ms, ms_low, ms_high per frame;
+    measured, whether the time was measured or estimated; num_parameters; outcome; on_front; hyperparameters, a dict.
+    Search points without an error or a time are left out.
+    """
+    rows = [*_finalist_points(summary), *_search_points(summary)]
+    analytic = summary.get("analytic")
+    if analytic:
+        times = {"ms": analytic["ms_per_frame"], "ms_low": analytic["ms_low"], "ms_high": analytic["ms_high"]}
+        rows.append({"name": ANALYTIC, "kind": "analytic", "group": ANALYTIC, "error": 0.0} | times)
+    defaults = {"measured": True, "outcome": "completed", "on_front": False}
+    return pd.DataFrame([defaults | row for row in rows])
+
+
+def growth_table(summary: Mapping) -> pd.DataFrame:
+    """One row a model and number of particles: time per frame with quartiles, and its two parts, in ms."""
+    models = summary.get("growth", {}).get("models", {})
+    return pd.DataFrame([{"model": name, **entry} for name, entries in models.items() for entry in entries])
+
+
+def strategies_table(summary: Mapping) -> pd.DataFrame:
+    """One row a point of the best-so-far curve of each search strategy: strategy, updates spent, error."""
+    strategies = summary.get("references", {}).get("strategies", {})
+    rows = [
+        {"strategy": name, "updates": updates, "error": error}
+        for name, strategy in strategies.items()
+        for updates, error in strategy["curve"]
+    ]
+    return pd.DataFrame(rows)
+
+
+def rung_audit_table(summary: Mapping) -> pd.DataFrame:
+    """One row a rung: updates, then value, low and high end of each measure of the audit, and the verdict.
+
+    Measures of a rung that too few trials reached are empty.
+    """
+    unknown = {"value": None, "low": None, "high": None}
+    rows = []
+    for rung in summary.get("rung_audit", []):
+        row = {"updates": rung["updates"]}
+        for name in AUDIT_MEASURES:
+            measure = rung.get(name) or unknown
+            row |= {name: measure["value"], f"{name}_low": measure["low"], f"{name}_high": measure["high"]}
+        rows.append(row | {"verdict": rung.get("verdict", "")})
+    return pd.DataFrame(rows)
+
+
+def _finalist_points(summary: Mapping) -> list[dict]:
+    marks = {"thesis_best": "thesis's best", summary["baseline"]: "baseline"}
+    marks[summary["recommended"]["id"]] = "recommended"
+    front = set(summary["pareto_front"])
+    return [
+        {
+            "name": entry["id"],
+            "kind": "finalist",
+            "group": marks.get(entry["id"], "finalist"),
+            "error": entry["test"]["normalized_mse"],
+            "error_low": entry["test"]["ci95"][0],
+            "error_high": entry["test"]["ci95"][1],
+            "ms": entry["cost"]["ms_per_frame"],
+            "ms_low": entry["cost"]["ms_low"],
+            "ms_high": entry["cost"]["ms_high"],
+            "num_parameters": entry["num_parameters"],
+            "on_front": entry["id"] in front,
+            "hyperparameters": entry["config"]["parameters"],
+        }
+        for entry in summary["finalists"]
+    ]
+
+
+def _search_points(summary: Mapping) -> list[dict]:
+    return [
+        {
+            "name": point["id"],
+            "kind": "search",
+            "group": point["stage"],
+            "error": point["valid_normalized_mse"],
+            "ms": point["ms_per_frame"],
+            "measured": point["measured"],
+            "num_parameters": point["num_parameters"],
+            "outcome": point["outcome"],
+            "hyperparameters": point["parameters"],
+        }
+        for point in summary.get("search_points", [])
+        if point["valid_normalized_mse"] is not None and point["ms_per_frame"] is not None
+    ]

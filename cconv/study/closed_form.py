@@ -1,14 +1,13 @@
 """The closed-form stage: least squares for every single linear layer that a search space holds.
 
-Such a layer needs no training and no seed: its coefficients are the solution of linear equations. All candidates are
-fitted to a few frames and compared on a few others; the most accurate of those that none beats in error and cost are
-fitted to the whole training split and become finalists.
+Such a layer needs no training and no seed: its coefficients are the solution of linear equations. Candidates are fitted
+to a few frames and compared on a few others; some of those that none beats in error and cost are fitted to the whole
+training split and become finalists.
 """
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import product
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -17,85 +16,145 @@ from cconv.data.targets import Sample
 from cconv.errors import ConfigError
 from cconv.evaluation.cost import flops_per_particle
 from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.config import StudyConfig
-from cconv.study.problem import Problem, provenance
-from cconv.study.records import RunFolder, TrialFolder, TrialRecord
+from cconv.study.problem import provenance
+from cconv.study.records import TrialFolder, TrialRecord
+from cconv.study.search import trial_name
 from cconv.study.selection import choose_finalists
+from cconv.study.session import Session
 from cconv.study.space import Choice, Parameter, SearchSpace, Value, configure
+from cconv.study.stages import reads_of
 from cconv.training.checkpoint import save_model
 from cconv.training.closed_form import solve_closed_form
 from cconv.training.field_model import NetworkConfig
 
 STAGE = "closed_form"
-_OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message")
+_OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message", "boundary", "density")
 _OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"), "radial": ("radial_terms",)}
-
-Progress = Callable[[Iterable, str], Iterable]
 
 
 def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: int) -> list[dict[str, Value]]:
     """Distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
+
+    Conditions hold as in the search. A space of deeper networks only has single layers too, as a floor to compare with.
 
     Args:
         space: The search space.
         network: Settings that the space does not vary.
         values_per_range: Values taken of a range of numbers.
     """
-    known = (*_OF_ANY, *_OF_BASIS["grid"], *_OF_BASIS["radial"])
-    axes = {name: _values(domain, values_per_range) for name, domain in space.parameters.items() if name in known}
+    drawn: list[dict] = [{}]
+    for name in space.parents_first:
+        values = [1] if name == "layers" else _values(space.parameters[name], values_per_range)
+        if name in ("layers", *_OF_ANY, *_OF_BASIS["grid"], *_OF_BASIS["radial"]):
+            drawn = [
+                layer | choice
+                for layer in drawn
+                for choice in ([{name: value} for value in values] if space.is_active(name, layer) else [{}])
+            ]
     layers: dict[str, dict] = {}
-    for values in product(*axes.values()):
-        drawn = {"basis": network.basis, **dict(zip(axes, values, strict=True))}
-        applies = (*_OF_ANY, *_OF_BASIS[drawn["basis"]])
-        layer = {"layers": 1, **{name: value for name, value in drawn.items() if name in applies}}
-        layers.setdefault(repr(sorted(layer.items())), layer)
+    for values in drawn:
+        basis = values.get("basis", network.basis)
+        applies = (*_OF_ANY, *_OF_BASIS[basis])
+        layer = {"layers": 1, "basis": basis, **{name: value for name, value in values.items() if name in applies}}
+        layers.setdefault(layer_id(layer), layer)
     return list(layers.values())
 
 
-def screen_closed_forms(
-    study: StudyConfig, space: SearchSpace, problem: Problem, run: RunFolder, progress: Progress
-) -> None:
-    """Fit every candidate, or as many as the study allows, to a few frames and record its error on a few others."""
-    settings = study.closed_form
-    layers = single_layers(space, study.network, settings.values_per_range)
-    layers = _draw(layers, settings.max_candidates, study.seeds.search)
-    train, valid = (
-        [samples[place] for place in evenly_spaced(len(samples), settings.screening_frames)]
-        for samples in (problem.train_samples, problem.valid_samples)
+def screen_closed_forms(session: Session, stage: str) -> dict:
+    """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
+
+    Half of them are drawn from all layers that the space holds; the others are one change away from those that would
+    become finalists, the cheapest first, until there is no such change left.
+    """
+    settings, problem = session.study.stages[stage], session.problem
+    layers = single_layers(session.space, session.study.network, settings.values_per_range)
+    samples = tuple(
+        [split[place] for place in evenly_spaced(len(split), settings.screening_frames)]
+        for split in (problem.train_samples, problem.valid_samples)
     )
-    for number, parameters in enumerate(progress(layers, "closed forms")):
-        folder = run.trial(f"{STAGE}_{number:04d}")
-        _fit_and_record(parameters, study, problem, (train, valid), folder, STAGE, study.seeds.init)
+    candidates = _candidates(session, stage, layers, settings.max_candidates)
+    for number, parameters in enumerate(session.progress(candidates, "closed forms")):
+        folder = session.run.trial(trial_name(stage, number))
+        _fit_and_record(session, parameters, samples, folder, stage, session.study.seeds.init, settings.ridge)
+    return {}
 
 
-def fit_closed_form_finalists(study: StudyConfig, problem: Problem, run: RunFolder, progress: Progress) -> None:
-    """Fit the best candidates to the whole training split; each has one retraining, as nothing in it is drawn."""
-    records = [record for record in run.trials() if record.stage == STAGE]
-    cost = {record.id: flops_of(record, study, problem) for record in records if record.outcome == "completed"}
-    chosen = choose_finalists(records, cost, study.closed_form.count)
-    for record in progress(chosen, "closed-form finalists"):
-        seed = study.seeds.init + 1
-        samples = problem.train_samples, problem.valid_samples
-        folder = run.finalist(record.id, seed)
-        _fit_and_record(record.parameters, study, problem, samples, folder, "finalists", seed)
+def _candidates(session: Session, stage: str, layers: list[dict[str, Value]], count: int) -> Iterator[dict[str, Value]]:
+    """At most `count` layers to fit, one after another; later ones depend on the records of earlier ones."""
+    left = count
+    untried = {layer_id(layer): layer for layer in layers}
+    batch = _draw(layers, (count + 1) // 2, session.seed_of(stage))
+    while batch and left:
+        for layer in batch[:left]:
+            del untried[layer_id(layer)]
+            if session.affordable(layer):
+                left -= 1
+                yield layer
+        batches = (_neighbors(record.parameters, untried.values()) for record in _winners(session, stage)[::-1])
+        batch = next(filter(None, batches), [])
 
 
-def flops_of(record: TrialRecord, study: StudyConfig, problem: Problem) -> float:
-    """Multiplications and additions of one particle's prediction by a trial's network."""
-    network, _ = configure(record.parameters, study.network, study.training)
-    return flops_per_particle(problem.build_model(network, 0), problem.valid_samples[0].inputs)
+def layer_id(layer: Mapping[str, Value]) -> str:
+    """What two layers share only if they are the same."""
+    return repr(sorted(layer.items()))
+
+
+def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
+    """The layers that differ in one setting; what comes and goes with a basis counts with it."""
+    return [other for other in others if sum(layer[name] != other[name] for name in layer if name in other) == 1]
+
+
+def _winners(session: Session, stage: str) -> list[TrialRecord]:
+    """The candidates that would become finalists, most accurate first."""
+    records = session.run.trials_of(stage)
+    cost = {record.id: record.config["flops_per_particle"] for record in records}
+    count = session.study.stages[stage].count
+    return choose_finalists(records, cost, count, session.study.selection.accurate_enough)
+
+
+def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> list[TrialRecord]:
+    """Fit the best candidates to the whole training split; each once, as nothing in it is drawn.
+
+    Args:
+        session: The study.
+        stage: The stage of the finalists, which reads stages of closed forms.
+        seed: Seed that names the folder.
+
+    Returns:
+        The candidates that were chosen.
+    """
+    study, chosen = session.study, []
+    for name in reads_of(study.stages, stage):
+        if study.stages[name].kind == STAGE:
+            best, ridge = _winners(session, name), study.stages[name].ridge
+            for record in session.progress(best, "closed-form finalists"):
+                folder = session.run.finalist(record.id, seed)
+                fit_whole(session, record.parameters, folder, "finalists", seed, ridge)
+            chosen += best
+    return chosen
+
+
+def fit_whole(
+    session: Session, parameters: Mapping[str, Value], folder: TrialFolder, stage: str, seed: int, ridge: float
+) -> None:
+    """Fit a layer to the whole training split and record its error on the whole validation split."""
+    samples = session.problem.train_samples, session.problem.valid_samples
+    _fit_and_record(session, parameters, samples, folder, stage, seed, ridge)
 
 
 def _fit_and_record(
+    session: Session,
     parameters: Mapping[str, Value],
-    study: StudyConfig,
-    problem: Problem,
     samples: tuple[Sequence[Sample], Sequence[Sample]],
     folder: TrialFolder,
     stage: str,
     init_seed: int,
+    ridge: float,
 ) -> None:
     """Fit a layer to the first of `samples` and record its error on the second. No weight depends on the seed."""
+    if folder.ended:
+        return
+    study, problem = session.study, session.problem
     network, training = configure(parameters, study.network, study.training)
     model = problem.build_model(network, 0)
     config = {
@@ -106,13 +165,15 @@ def _fit_and_record(
         "init_seed": init_seed,
         "data_seed": study.seeds.data,
         "num_parameters": model.num_parameters,
+        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
         "closed_form": True,
+        "ridge": ridge,
     }
     folder.start(config)
     train, valid = samples
     start = time.perf_counter()
     try:
-        solve_closed_form(model, train, study.closed_form.ridge)
+        solve_closed_form(model, train, ridge)
     except ConfigError as error:
         folder.finish("failed", str(error))
         return

@@ -2,7 +2,7 @@
 
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +10,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cconv.errors import ConfigError
 from cconv.sph.kernels import KERNELS
+from cconv.study.rungs import rungs_up_to
+from cconv.study.stages import Stage, check_order, default_stages
 from cconv.training.field_model import NetworkConfig
 from cconv.validation import StrictModel, validated
 
@@ -47,60 +49,47 @@ class TrainingConfig(StrictModel):
 
 
 class SearchConfig(StrictModel):
-    """Random and adaptive search with ASHA. `concurrency` None means as many trials at once as cores.
+    """What random and adaptive searches share: the space, ASHA's rungs, limits of a trial.
 
-    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped; 1 is predicting the mean.
+    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped; 1 is predicting the mean. One
+    that has trained for `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency`
+    None means as many trials at once as cores.
     """
 
     space: str
-    random_trials: int = Field(16, ge=1)
-    adaptive_trials: int = Field(16, ge=0)
     grace_updates: int = Field(50, ge=1)
     reduction_factor: int = Field(3, ge=2)
     give_up_above: float = Field(10.0, gt=0)
+    trial_seconds: float = Field(3600.0, gt=0)
     concurrency: int | None = Field(None, ge=1)
 
 
-class ClosedFormConfig(StrictModel):
-    """Least squares for the single linear layers of the space; no stage of that kind without this table.
-
-    At most `max_candidates` layers are fitted to `screening_frames` frames, ranges sampled at `values_per_range`
-    places; the `count` best are fitted to all frames and become finalists.
-    """
-
-    count: int = Field(3, ge=1)
-    max_candidates: int = Field(200, ge=1)
-    screening_frames: int = Field(4, ge=1)
-    values_per_range: int = Field(3, ge=2)
-    ridge: float = Field(1e-10, ge=0)
-
-
-class InitializationConfig(StrictModel):
-    """Trainings of the baseline that differ in initial weights alone; no stage of that kind without this table."""
+class FinalistsConfig(StrictModel):
+    """Protocol of every retraining and test. `updates` None means the search's budget."""
 
     seeds: int = Field(5, ge=2)
-
-
-class SelectionConfig(StrictModel):
-    """When accurate is accurate enough: models below `accurate_enough` count as equal, and the cheapest wins."""
-
-    accurate_enough: float | None = Field(None, gt=0)
-
-
-class FinalistsConfig(StrictModel):
-    """Retraining of the best configurations with fresh seeds. `updates` None means the search's budget."""
-
-    count: int = Field(3, ge=1)
-    seeds: int = Field(2, ge=2)
     updates: int | None = Field(None, ge=1)
     frames_per_block: int = Field(3, ge=1)
 
 
+class SelectionConfig(StrictModel):
+    """When accurate is accurate enough.
+
+    Models below `accurate_enough` count as equal, and the cheapest wins; `margin` is how much worse than the best a
+    model may be, as a share of the best error, to count as not inferior.
+    """
+
+    accurate_enough: float | None = Field(None, gt=0)
+    margin: float = Field(0.05, gt=0)
+
+
 class CostConfig(StrictModel):
-    """Isolated timing of the finalists."""
+    """Isolated timing of the finalists; of `trials` further models for the check of the cost model; growth with N."""
 
     threads: int = Field(1, ge=1)
     repeats: int = Field(20, ge=3)
+    trials: int = Field(6, ge=0)
+    sizes: tuple[int, ...] = (1000, 3000, 10_000, 30_000, 100_000)
 
 
 class SeedsConfig(StrictModel):
@@ -119,27 +108,45 @@ class StudyConfig(StrictModel):
     data: DataConfig = DataConfig()
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
-    closed_form: ClosedFormConfig | None = None
-    initialization: InitializationConfig | None = None
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
     cost: CostConfig = CostConfig()
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
+    stages: dict[str, Stage] = Field(default_factory=default_stages, min_length=1)
+
+    @field_validator("stages", mode="before")
+    @classmethod
+    def _kinds_from_names(cls, stages: object) -> object:
+        if not isinstance(stages, Mapping):
+            return stages
+        return {name: {"kind": name} | stage if isinstance(stage, dict) else stage for name, stage in stages.items()}
+
+    @field_validator("stages")
+    @classmethod
+    def _stages_read_earlier_ones(cls, stages: dict[str, Stage]) -> dict[str, Stage]:
+        check_order(stages)
+        return stages
 
     @model_validator(mode="after")
     def _budgets_fit(self) -> "StudyConfig":
-        if self.search.grace_updates > self.training.updates:
+        search, training = self.search, self.training
+        if search.grace_updates > training.updates:
             raise ValueError(
-                f"search.grace_updates ({self.search.grace_updates}) must not exceed "
-                f"training.updates ({self.training.updates})"
+                f"search.grace_updates ({search.grace_updates}) must not exceed training.updates ({training.updates}), "
+                "or no rung would be reached"
             )
-        if self.search.grace_updates % self.training.evaluate_every:
+        if search.grace_updates % training.evaluate_every:
             raise ValueError(
-                f"search.grace_updates ({self.search.grace_updates}) must be a multiple of "
-                f"training.evaluate_every ({self.training.evaluate_every}), or no rung would be evaluated"
+                f"search.grace_updates ({search.grace_updates}) must be a multiple of "
+                f"training.evaluate_every ({training.evaluate_every}), or no rung would be evaluated"
             )
         return self
+
+    @property
+    def rungs(self) -> list[int]:
+        """Updates of ASHA's rungs, the full budget last."""
+        return rungs_up_to(self.training.updates, self.search.grace_updates, self.search.reduction_factor)
 
     @property
     def concurrency(self) -> int:

@@ -1,7 +1,7 @@
 """Finalists: the best configurations and the baseline retrained with fresh seeds, tested and timed."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,11 +16,16 @@ from cconv.evaluation.metrics import (
     normalized_mse,
     per_frame_normalized_mse,
 )
+from cconv.study.closed_form import fit_closed_form_finalists
+from cconv.study.config import StudyConfig, TrainingConfig
 from cconv.study.records import RunFolder, TrialRecord
-from cconv.study.search import Job
+from cconv.study.search import train_all
+from cconv.study.selection import choose_finalists
+from cconv.study.session import BASELINE, Session
+from cconv.study.trial_queue import Job
 from cconv.training.checkpoint import load_model, read_card, save_model
 
-BASELINE = "baseline"
+FINALISTS = "finalists"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,13 +58,43 @@ class Retrained:
     @property
     def valid_errors(self) -> list[float]:
         """Validation error of each checkpoint: the best of its evaluations."""
-        logs = [record.log for record in self.records]
-        return [min(entry["valid_normalized_mse"] for entry in log) for log in logs]
+        return [record.best for record in self.records]
 
     @property
     def best_checkpoint(self) -> Path:
         """Checkpoint of the smallest validation error."""
         return self.checkpoints[int(np.argmin(self.valid_errors))]
+
+
+def retrain_finalists(session: Session, stage: str) -> dict:
+    """Retrain the baseline, named configurations and the best of the searches with fresh seeds; fit the closed forms.
+
+    Returns:
+        "finalists": the hyperparameters of each, by id.
+    """
+    study, settings = session.study, session.study.stages[stage]
+    first_seed = study.seeds.init + 1
+    closed = fit_closed_form_finalists(session, stage, first_seed)
+    named = {BASELINE: session.space.baseline, **settings.include}
+    searched = {record.id: record.parameters for record in best_trials(session, stage)}
+    trained = [Finalist(id=name, parameters=parameters) for name, parameters in (named | searched).items()]
+    jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
+    train_all(session, FINALISTS, jobs, finalist_training(study))
+    return {"finalists": named | searched | {record.id: record.parameters for record in closed}}
+
+
+def best_trials(session: Session, stage: str) -> list[TrialRecord]:
+    """The best trained configurations of the searches that a stage reads, the baseline's own left out."""
+    records = session.read(stage, "random", "adaptive")
+    others = [record for record in records if record.parameters != session.space.baseline]
+    cost = {record.id: record.config["flops_per_particle"] for record in others}
+    count, enough = session.study.stages[stage].count, session.study.selection.accurate_enough
+    return choose_finalists(others, cost, count, enough)
+
+
+def finalist_training(study: StudyConfig) -> TrainingConfig:
+    """Training settings of the finalists: the search's, with their own budget."""
+    return study.training.model_copy(update={"updates": study.finalists.updates or study.training.updates})
 
 
 def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int, run: RunFolder) -> list[Job]:
@@ -69,7 +104,7 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
     """
     return [
         Job(
-            folder=run.finalist(finalist.id, seed).path,
+            folder=run.finalist(finalist.id, seed).path.absolute(),
             name=f"{finalist.id}/seed_{seed}",
             parameters=finalist.parameters,
             init_seed=seed,
@@ -79,10 +114,14 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
     ]
 
 
-def retrained_finalists(run: RunFolder, num_seeds: int) -> tuple[list[Retrained], dict[str, str]]:
+def retrained_finalists(
+    run: RunFolder, finalists: Iterable[str], num_seeds: int
+) -> tuple[list[Retrained], dict[str, str]]:
     """Finalists all of whose seeds finished, a closed form's single fit, and for each other one what became of it."""
     retrained, failed = [], {}
-    for finalist, records in run.retrainings().items():
+    retrainings = run.retrainings()
+    for finalist in finalists:
+        records = retrainings[finalist]
         lost = [record for record in records if record.outcome != "completed"]
         wanted = 1 if records[0].is_closed_form else num_seeds
         if lost or len(records) < wanted:
@@ -94,22 +133,25 @@ def retrained_finalists(run: RunFolder, num_seeds: int) -> tuple[list[Retrained]
     return retrained, failed
 
 
-def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> dict:
-    """Test errors of a finalist over its seeds, as they stand in summary.json.
+def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> tuple[dict, np.ndarray]:
+    """Test errors of a finalist over its seeds.
 
     Args:
         finalist: The finalist.
         samples: Frames of the test split.
         frames_per_block: Frames of a unit of the interval where there is a single test trajectory.
+
+    Returns:
+        What stands in summary.json, and the errors of each seed and unit (seeds, units).
     """
     errors = [frame_errors(load_model(checkpoint), samples) for checkpoint in finalist.checkpoints]
     by_seed = [normalized_mse(seed) for seed in errors]
     per_frame = [per_frame_normalized_mse(seed) for seed in errors]
     units = np.stack([blocks_of_errors(seed, frames_per_block) for seed in errors])
-    if units.size == 1:  # one fit, one short trajectory: its frames are all that can vary
+    if units.shape[1] == 1:  # a single short trajectory: its frames are all that can vary
         units = np.stack([blocks_of_errors(seed, 1) for seed in errors])
     mean = float(np.mean(by_seed))
-    return {
+    facts = {
         "normalized_mse": mean,
         "relative_rmse": math.sqrt(mean),
         "per_frame_normalized_mse": None if None in per_frame else float(np.mean(per_frame)),
@@ -117,6 +159,7 @@ def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per
         "by_seed": dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         "units": {"count": units.shape[1], "worst": float(units.mean(axis=0).max())},
     }
+    return facts, units
 
 
 def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder) -> dict:

@@ -1,79 +1,42 @@
-"""The initialisation stage: how much of the spread among configurations is the luck of initial weights (thesis, 4.1).
+"""The initialisation stage (thesis, 4.1): the luck of initial weights beside the choice of a configuration.
 
-One configuration, the baseline, is trained with many seeds to the full budget. Its errors at each rung are set beside
-those of the random search, whose trials share one seed and differ in configuration.
+The baseline is trained with many seeds, and many random configurations with one seed; nothing is stopped. So the same
+trainings tell at every rung how much of the spread is luck, and how well a rung foretells the full budget.
 """
 
-import math
-from collections.abc import Sequence
-
-import numpy as np
-import scipy.stats
-
 from cconv.study.records import RunFolder, TrialRecord
-from cconv.study.search import Job, Session, run_jobs
+from cconv.study.replay import compare_strategies, learning_curves
+from cconv.study.rung_audit import audit_rungs
+from cconv.study.sampling import random_parameters
+from cconv.study.search import train_all, trial_job
+from cconv.study.session import Session
+from cconv.study.variance import variance_decomposition
 
-STAGE = "initialization"
 
-
-def train_many_seeds(session: Session) -> None:
-    """Train the baseline with as many seeds as the study asks for; none of them is used by another stage."""
-    study, run = session.study, session.run
-    first = study.seeds.init + 1 + study.finalists.seeds
-    jobs = [
-        Job(
-            folder=run.trial(f"{STAGE}_{number:04d}").path,
-            name=f"{STAGE}_{number:04d}",
-            parameters=session.space.baseline,
-            init_seed=first + number,
-        )
-        for number in range(study.initialization.seeds)
+def train_unstopped(session: Session, stage: str) -> dict:
+    """Train the baseline with many seeds and many configurations with one; compare their spreads, audit the rungs."""
+    study, settings = session.study, session.study.stages[stage]
+    first = study.seeds.init + 1 + study.finalists.seeds  # seeds that no other stage uses
+    draws = [
+        random_parameters(session.space, session.seed_of(stage), number, session.affordable)
+        for number in range(settings.configurations)
     ]
-    run_jobs(session, jobs, STAGE, study.training)
-
-
-def variance_decomposition(run: RunFolder) -> list[dict]:
-    """One entry a rung of the random search, as they stand in summary.json; none without the stage.
-
-    Returns:
-        Entries of "updates"; "seeds" and "configurations", how many of each reached the rung; "seed_spread" and
-        "configuration_spread", standard deviations of the decimal logarithm of the error; "seed_share", the
-        variance over seeds by that over configurations (which holds both), and "seed_share_ci95", its interval by the
-        F-distribution. From the second rung on the configurations are those that were not stopped.
-    """
-    records = run.trials()
-    seeds = [record for record in records if record.stage == STAGE]
-    rungs = run.read("rungs.json").get("random", []) if seeds else []
-    entries = []
-    for rung in rungs:
-        over_seeds = _logarithms(_error_at(record, rung["updates"]) for record in seeds)
-        over_configurations = _logarithms(rung["recorded"].values())
-        if min(len(over_seeds), len(over_configurations)) > 1:
-            entries.append({"updates": rung["updates"], **_compare(over_seeds, over_configurations)})
-    return entries
-
-
-def _compare(over_seeds: Sequence[float], over_configurations: Sequence[float]) -> dict:
-    variances = [float(np.var(values, ddof=1)) for values in (over_seeds, over_configurations)]
-    freedom = [len(values) - 1 for values in (over_seeds, over_configurations)]
-    share = variances[0] / variances[1] if variances[1] > 0 else None
-    interval = None
-    if share is not None:
-        low, high = (scipy.stats.f.ppf(level, *freedom) for level in (0.025, 0.975))
-        interval = [float(share / high), float(share / low)]
+    trainings = [(session.space.baseline, first + number) for number in range(settings.seeds)]
+    trainings += [(parameters, study.seeds.init) for parameters in draws]
+    jobs = [trial_job(session, stage, number, *training) for number, training in enumerate(trainings)]
+    train_all(session, stage, jobs, study.training)
+    seeds, configurations = by_purpose(session.run, stage, study.seeds.init)
+    completed = [record for record in configurations if record.outcome == "completed"]
+    seed, factor = session.seed_of(stage), study.search.reduction_factor
     return {
-        "seeds": len(over_seeds),
-        "configurations": len(over_configurations),
-        "seed_spread": math.sqrt(variances[0]),
-        "configuration_spread": math.sqrt(variances[1]),
-        "seed_share": share,
-        "seed_share_ci95": interval,
+        "initialization": variance_decomposition(seeds, configurations, study.rungs),
+        "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor, seed=seed),
+        "strategies": compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
     }
 
 
-def _error_at(record: TrialRecord, updates: int) -> float | None:
-    return next((entry["valid_normalized_mse"] for entry in record.log if entry["updates"] == updates), None)
-
-
-def _logarithms(errors) -> list[float]:
-    return [math.log10(error) for error in errors if error is not None and error > 0]
+def by_purpose(run: RunFolder, stage: str, search_seed: int) -> tuple[list[TrialRecord], list[TrialRecord]]:
+    """The stage's trainings of the baseline with many seeds, and those of many configurations with the search's."""
+    records = run.trials_of(stage)
+    configurations = [record for record in records if record.config["init_seed"] == search_seed]
+    return [record for record in records if record not in configurations], configurations

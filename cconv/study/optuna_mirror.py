@@ -1,52 +1,117 @@
-"""Our trial records as an Optuna study, in a journal file that Optuna's tools open."""
+"""Our trials as an Optuna study, live, in a journal file or a database that Optuna's tools open.
 
-from collections.abc import Sequence
+Nothing of ours reads it: the records are the truth. Only a trial of the full budget is COMPLETE; one that ended earlier
+is PRUNED with its errors at each evaluation, so that errors of different budgets are never compared as equals.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import optuna
-from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import FrozenTrial, TrialState, create_trial
+from optuna.trial import Trial, TrialState, create_trial
 
-from cconv.study.records import DIVERGED_ERROR, TrialRecord
-from cconv.study.space import SearchSpace, optuna_distributions
-
-
-def open_journal(path: Path) -> BaseStorage:
-    """Optuna storage in a journal file; new trials append to it."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return JournalStorage(JournalFileBackend(str(path)))
+from cconv.errors import ConfigError
+from cconv.study.records import DIVERGED_ERROR
+from cconv.study.sampling import distributions_of
+from cconv.study.space import SearchSpace
 
 
-def mirror_trials(
-    records: Sequence[TrialRecord], space: SearchSpace, max_updates: int, storage: BaseStorage, study_name: str
-) -> None:
-    """Add finished trials to an Optuna study.
+def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
+    """Optuna's storage: a journal file, or the database at `url`, e.g. ``postgresql+psycopg://user@host/studies``.
 
-    Only a trial of the full budget is COMPLETE; one stopped earlier is PRUNED with its errors at each evaluation, so
-    that errors of different budgets are never compared as equals. A diverged trial is PRUNED with a huge last error, so
-    that the sampler keeps away from it; a trial without any error is FAIL.
+    Raises:
+        ConfigError: If the database cannot be reached or its driver is not installed.
     """
-    study = optuna.create_study(storage=storage, study_name=study_name, direction="minimize", load_if_exists=True)
-    for record in records:
-        study.add_trial(_as_optuna(record, space, max_updates))
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    if url is None:
+        return JournalStorage(JournalFileBackend(str(journal)))
+    try:
+        return RDBStorage(url)
+    except Exception as error:  # of SQLAlchemy, of the driver, or of the import of the driver
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"--storage {_without_password(url)}: no database there that Optuna can use ({reason}); "
+            "start it, or leave --storage out for a journal file in the run folder."
+        ) from error
 
 
-def _as_optuna(record: TrialRecord, space: SearchSpace, max_updates: int) -> FrozenTrial:
-    values = {
-        entry["updates"]: entry["valid_normalized_mse"]
-        for entry in record.log
-        if entry["valid_normalized_mse"] is not None
-    }
-    if record.outcome == "diverged" and record.log:
-        values[record.log[-1]["updates"]] = DIVERGED_ERROR
-    complete = record.outcome == "completed" and max_updates in values
-    state = TrialState.COMPLETE if complete else TrialState.PRUNED if values else TrialState.FAIL
-    return create_trial(
-        state=state,
-        value=values[max_updates] if complete else None,
-        params=record.parameters,
-        distributions=optuna_distributions(space),
-        intermediate_values=values,
-        user_attrs={"trial": record.id, "num_parameters": record.config["num_parameters"]},
-    )
+def _without_password(url: str) -> str:
+    scheme, separator, rest = url.partition("://")
+    login, at, place = rest.rpartition("@")
+    return f"{scheme}{separator}{login.partition(':')[0]}{at}{place}"
+
+
+class OptunaMirror:
+    """An observer that repeats what it sees in an Optuna study.
+
+    A trial that the storage holds already goes on there; one that it holds as running and that no record knows failed.
+
+    Args:
+        storage: Where the study is.
+        study_name: Its name.
+        space: Search space of all trials, refined ones included.
+        full_updates: Full budget.
+        known: Names of the trials that are on record.
+    """
+
+    def __init__(
+        self, storage: BaseStorage, study_name: str, space: SearchSpace, full_updates: int, known: Iterable[str]
+    ):
+        self._study = optuna.create_study(
+            storage=storage, study_name=study_name, direction="minimize", load_if_exists=True
+        )
+        self._space, self._full_updates = space, full_updates
+        self._numbers: dict[str, int] = {}
+        known = set(known)
+        for trial in self._study.get_trials(deepcopy=False):
+            name = trial.user_attrs.get("trial")
+            if name in known and trial.state != TrialState.FAIL:
+                self._numbers[name] = trial.number
+            elif not trial.state.is_finished():
+                self._study.tell(trial.number, state=TrialState.FAIL)
+
+    def end_running(self) -> None:
+        """Tell FAIL for every trial that is still running, so that none is left so when a run ends early."""
+        for trial in self._study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
+            self._study.tell(trial.number, state=TrialState.FAIL)
+
+    def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
+        """Nothing: all searches share the study."""
+
+    def on_trial_start(self, trial: str, parameters: Mapping) -> None:
+        """Add a running trial."""
+        if trial in self._numbers:
+            return
+        running = create_trial(
+            state=TrialState.RUNNING,
+            params=dict(parameters),
+            distributions=distributions_of(self._space, parameters),
+            user_attrs={"trial": trial},
+        )
+        self._study.add_trial(running)
+        self._numbers[trial] = len(self._study.get_trials(deepcopy=False)) - 1
+
+    def on_trial_result(self, trial: str, entry: Mapping) -> None:
+        """Add the error of an evaluation; a huge one where the trial diverged, so that samplers keep away."""
+        frozen = self._frozen(trial)
+        error = entry["valid_normalized_mse"]
+        value = DIVERGED_ERROR if entry["diverged"] or error is None else error
+        if entry["updates"] not in frozen.intermediate_values and not frozen.state.is_finished():
+            Trial(self._study, frozen._trial_id).report(value, entry["updates"])
+
+    def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
+        """COMPLETE with the last error at the full budget, PRUNED below it, FAIL without any error."""
+        frozen = self._frozen(trial)
+        if frozen.state.is_finished():
+            return
+        values = frozen.intermediate_values
+        if outcome == "completed" and math.isfinite(values.get(self._full_updates, math.nan)):
+            self._study.tell(frozen.number, values[self._full_updates])
+        else:
+            self._study.tell(frozen.number, state=TrialState.PRUNED if values else TrialState.FAIL)
+
+    def _frozen(self, trial: str):
+        return self._study.get_trials(deepcopy=False)[self._numbers[trial]]

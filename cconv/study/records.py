@@ -1,26 +1,34 @@
 """The run folder: our own records of a study. Ray's files are disposable, these are the truth."""
 
+import fcntl
 import json
+import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from cconv.errors import ConfigError, DataError
 
-SEARCHES = ("closed_form", "initialization", "random", "adaptive")  # stages whose trials stand in trials/
-# Ray and Optuna need a finite number where a trial diverged; our records hold none there.
-DIVERGED_ERROR = 1e9
+FORMAT = 2  # of a run folder; another one is refused
+DIVERGED_ERROR = 1e9  # Optuna needs a finite number where a trial diverged; our records hold none there
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
 
 
 def write_json(path: Path, value) -> None:
     """Write JSON under a temporary name, then rename, so that a reader never finds half a file."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file under a temporary name, then rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}-{os.getpid()}")
     try:
-        part.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+        part.write_text(text)
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
@@ -68,6 +76,12 @@ class TrialRecord:
         return self.config.get("closed_form", False)
 
     @property
+    def best(self) -> float:
+        """Smallest validation error of the log, that of the checkpoint; infinity where there is none."""
+        finite = (entry["valid_normalized_mse"] for entry in self.log)
+        return min((error for error in finite if error is not None), default=math.inf)
+
+    @property
     def last(self) -> dict | None:
         """The last evaluation with a finite error, or None."""
         finite = [entry for entry in self.log if entry["valid_normalized_mse"] is not None]
@@ -75,11 +89,12 @@ class TrialRecord:
 
 
 class TrialFolder:
-    """Files of one trial: config.json, log.jsonl, outcome.json, checkpoint/."""
+    """Files of one trial: config.json, log.jsonl, outcome.json, checkpoint/, and its progress while it runs."""
 
     def __init__(self, path: Path):
         self.path = path
         self.checkpoint = path / "checkpoint"
+        self.progress = path / "progress.safetensors"
 
     @property
     def started(self) -> bool:
@@ -92,45 +107,57 @@ class TrialFolder:
         (self.path / "log.jsonl").write_text("")
         write_json(self.path / "config.json", config)
 
+    def go_on(self, updates: int) -> None:
+        """Drop what was logged after `updates`, from where the training goes on."""
+        kept = [entry for entry in self.log() if entry["updates"] <= updates]
+        write_text(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in kept))
+
     def append(self, entry: Mapping) -> None:
         """Add one line to the log."""
         with (self.path / "log.jsonl").open("a") as file:
             file.write(json.dumps(entry) + "\n")
 
     def finish(self, outcome: str, reason: str = "") -> None:
-        """Record how the trial ended."""
+        """Record how the trial ended; it does not go on from there."""
+        self.progress.unlink(missing_ok=True)
         write_json(self.path / "outcome.json", {"outcome": outcome, "reason": reason})
 
     @property
-    def reason(self) -> str:
-        """Why the trial failed, as far as it could say; else ""."""
-        return self._end()["reason"]
+    def ended(self) -> bool:
+        """Whether it is known how the trial ended."""
+        return (self.path / "outcome.json").is_file()
 
-    def _end(self) -> dict:
-        ended = self.path / "outcome.json"
-        return read_json(ended) if ended.is_file() else {"outcome": "interrupted", "reason": ""}
-
-    def _log(self) -> list[dict]:
+    def log(self) -> list[dict]:
+        """Evaluations so far; a last line cut short by a kill is left out."""
         path = self.path / "log.jsonl"
-        lines = path.read_text().splitlines() if path.is_file() else []
+        lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
         if lines and not lines[-1].endswith("}"):
             lines.pop()
+        return [self._entry(path, number, line) for number, line in enumerate(lines, start=1)]
+
+    @staticmethod
+    def _entry(path: Path, number: int, line: str) -> dict:
         try:
-            return [json.loads(line) for line in lines]
-        except json.JSONDecodeError as error:
-            raise DataError(f"{path}: a line is not JSON ({error}); delete that line.") from error
+            entry = json.loads(line)
+            entry["updates"], entry["valid_normalized_mse"], entry["seconds"]  # noqa: B018, what every reader needs
+        except (ValueError, TypeError, KeyError) as error:
+            raise DataError(f"{path}: line {number} is no evaluation's record ({error}); delete that line.") from error
+        return entry
 
     def read(self) -> TrialRecord:
-        """Everything that was recorded; a last log line cut short by a kill is left out."""
+        """Everything that was recorded.
+
+        Raises:
+            DataError: If a file is damaged.
+        """
         config = read_json(self.path / "config.json")
-        log = self._log()
-        end = self._end()
+        end = read_json(self.path / "outcome.json") if self.ended else {"outcome": "interrupted", "reason": ""}
         return TrialRecord(
             id=self.path.name,
             stage=config["stage"],
             parameters=config["parameters"],
             config=config,
-            log=log,
+            log=self.log(),
             outcome=end["outcome"],
             reason=end["reason"],
         )
@@ -169,12 +196,34 @@ class RunFolder:
         """An existing run folder.
 
         Raises:
-            DataError: If it is none.
+            DataError: If it is none, or one of another version.
         """
         run = cls(path)
         if not (run.path / "study.json").is_file():
             raise DataError(f"{run.path}: no study.json; give the folder that `cconv study run` printed.")
+        written = run.read("study.json").get("format", 1)
+        if written != FORMAT:
+            raise DataError(
+                f"{run.path}: a run folder of format {written}, and this version of cconv reads format {FORMAT}; "
+                "run the study again, or open it with the version in its environment.json."
+            )
         return run
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder alone; the system lets go of it even if the process is killed.
+
+        Raises:
+            ConfigError: If another run works in the folder.
+        """
+        with (self.path / "run.lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConfigError(
+                    f"{self.path}: another run works in this folder; wait for it (`cconv study status`) or stop it."
+                ) from error
+            yield
 
     def trial(self, trial_id: str) -> TrialFolder:
         """Folder of a search trial."""
@@ -186,8 +235,27 @@ class RunFolder:
 
     def trials(self) -> list[TrialRecord]:
         """Records of all search trials, stage after stage, in the order in which they were drawn."""
+        stages = [*self.read("study.json")["stages"]]
         records = [TrialFolder(config.parent).read() for config in (self.path / "trials").glob("*/config.json")]
-        return sorted(records, key=lambda record: (SEARCHES.index(record.stage), record.id))
+        return sorted(records, key=lambda record: (stages.index(record.stage), record.id))
+
+    def trials_of(self, stage: str) -> list[TrialRecord]:
+        """Records of one stage's trials, in the order in which they were drawn."""
+        folders = sorted((self.path / "trials").glob(f"{stage}_[0-9]*/config.json"))
+        records = [TrialFolder(config.parent).read() for config in folders]
+        return [record for record in records if record.stage == stage]
+
+    def has_result(self, stage: str) -> bool:
+        """Whether a stage has come to its end."""
+        return (self.path / "stages" / f"{stage}.json").is_file()
+
+    def result(self, stage: str) -> dict:
+        """What a stage that ended has found."""
+        return self.read(f"stages/{stage}.json")
+
+    def forget_result(self, stage: str) -> None:
+        """Make a stage one that has not come to its end; its trials stay."""
+        (self.path / "stages" / f"{stage}.json").unlink(missing_ok=True)
 
     def retrainings(self) -> dict[str, list[TrialRecord]]:
         """Records of all retrainings, by finalist."""
@@ -207,3 +275,10 @@ class RunFolder:
     def set_state(self, state: str, stage: str) -> None:
         """Record whether the run is "running", "finished", "interrupted" or "failed", and in which stage."""
         self.write("state.json", {"state": state, "stage": stage})
+
+
+def count_outcomes(records: Sequence[TrialRecord]) -> dict[str, dict[str, int]]:
+    """Number of trials of each outcome, by stage."""
+    stages = list(dict.fromkeys(record.stage for record in records))
+    counts = {stage: Counter(record.outcome for record in records if record.stage == stage) for stage in stages}
+    return {stage: {outcome: counts[stage][outcome] for outcome in OUTCOMES} for stage in stages}

@@ -1,267 +1,159 @@
-"""Trials in parallel with Ray Tune: random and adaptive search with ASHA, and plain lists of trainings."""
+"""What the stages of a search train: random and adaptive trials with ASHA, and the same budget spent otherwise.
 
-import os
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import count
-from pathlib import Path
+Every trial is a function of the study's seeds and of records, never of a sampler's memory. So a search that was killed
+goes on as it would have, and one that finished takes more trials.
+"""
 
-from cconv.study.config import StudyConfig, TrainingConfig
-from cconv.study.observer import Observer
-from cconv.study.problem import Problem, provenance
-from cconv.study.records import DIVERGED_ERROR, RunFolder, TrialFolder
-from cconv.study.space import SearchSpace, optuna_distributions, ray_domains
+import math
+from collections.abc import Iterator, Mapping, Sequence
 
-METRIC = "valid_normalized_mse"
-RAY_OBJECT_STORE_BYTES = 2**30
+from cconv.study.config import TrainingConfig
+from cconv.study.records import RunFolder, TrialFolder, TrialRecord, read_json
+from cconv.study.replay import best_so_far, spent_updates
+from cconv.study.rungs import RungFile
+from cconv.study.sampling import random_parameters, suggest_parameters
+from cconv.study.session import Session
+from cconv.study.trial_queue import Job, NothingStops, StopsByRungs, TrialQueue
 
 
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """One training.
+def random_search(session: Session, stage: str) -> dict:
+    """Random search with ASHA."""
+    settings = session.study.stages[stage]
+    space, seed = session.space_of(stage), session.seed_of(stage)
 
-    Attributes:
-        folder: Where it is recorded.
-        name: Name to show.
-        parameters: Hyperparameters.
-        init_seed: Seed of the initial weights.
-    """
+    def jobs() -> Iterator[Job]:
+        for number in range(settings.trials):
+            yield trial_job(session, stage, number, random_parameters(space, seed, number, session.affordable))
 
-    folder: Path
-    name: str
-    parameters: dict
-    init_seed: int
+    _search(session, stage, jobs(), settings.trials)
+    return {}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Session:
-    """What all stages of a run share.
+def adaptive_search(session: Session, stage: str) -> dict:
+    """Tree-structured Parzen estimator with ASHA for error and cost, which learns from the stages that it reads."""
+    settings, study = session.study.stages[stage], session.study
+    space, earlier = session.space_of(stage), session.read(stage)
 
-    Attributes:
-        study: The study.
-        space: Its search space.
-        problem: Scene, task and samples.
-        run: Where everything is recorded.
-        observer: Sees the trials as they run.
-    """
+    def jobs() -> Iterator[Job]:
+        for number in range(settings.trials):
+            yield trial_job(session, stage, number, recorded_parameters(session.run, stage, number) or propose(number))
 
-    study: StudyConfig
-    space: SearchSpace
-    problem: Problem
-    run: RunFolder
-    observer: Observer
-
-    @property
-    def ray_folder(self) -> Path:
-        """Ray's own files, which nothing of ours reads."""
-        return self.run.path.absolute() / "ray"
-
-
-@contextmanager
-def ray_session(session: Session) -> Iterator[None]:
-    """A private Ray on this machine with one core a trial; its files go when it ends."""
-    os.environ.update(
-        RAY_AUTH_MODE="disabled",  # tokens would be written to the home folder
-        RAY_USAGE_STATS_ENABLED="0",
-        RAY_CHDIR_TO_TRIAL_DIR="0",  # data paths stay valid
-        RAY_AIR_NEW_OUTPUT="0",  # its boxes are printed even when silent
-        RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="0",  # leave the accelerators' variables alone
-        TUNE_DISABLE_SIGINT_HANDLER="1",  # Ctrl-C is ours
-        TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # our records are the truth
-        TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S="0",
-        TUNE_WARN_THRESHOLD_S="60",
-    )
-    import ray
-
-    try:
-        ray.init(
-            num_cpus=session.study.concurrency,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-            object_store_memory=RAY_OBJECT_STORE_BYTES,
+    def propose(number: int) -> dict:
+        records = [*earlier, *session.run.trials_of(stage)]
+        return suggest_parameters(
+            space,
+            records,
+            number=number,
+            seed=session.seed_of(stage),
+            full_updates=study.training.updates,
+            affordable=session.affordable,
+            costs={record.id: record.config["flops_per_particle"] for record in records},
         )
-        yield
-    finally:
-        ray.shutdown()
-        shutil.rmtree(session.ray_folder, ignore_errors=True)
+
+    _search(session, stage, jobs(), settings.trials)
+    return {}
 
 
-def random_search(session: Session) -> None:
-    """Random search with ASHA, the baseline first."""
-    from ray.tune.search.basic_variant import BasicVariantGenerator
+def spend_otherwise(session: Session, stage: str) -> dict:
+    """The budget of each search that the stage reads, spent as "train each a little, keep the best".
 
-    seed = session.study.seeds.search
-    sampler = BasicVariantGenerator(points_to_evaluate=[session.space.baseline], random_state=seed)
-    _search(session, "random", session.study.search.random_trials, sampler, ray_domains(session.space))
-
-
-def adaptive_search(session: Session) -> None:
-    """Tree-structured Parzen estimator (Optuna) with ASHA, the baseline first; it knows the random trials' errors."""
-    from optuna.samplers import TPESampler
-
-    from cconv.study.asha import RungAwareOptunaSearch
-    from cconv.study.optuna_mirror import mirror_trials, open_journal
-
-    study, space = session.study, session.space
-    journal = open_journal(session.run.path / "optuna.journal")
-    searched = [record for record in session.run.trials() if record.stage == "random"]
-    mirror_trials(searched, space, study.training.updates, journal, study.name)
-    sampler = RungAwareOptunaSearch(
-        optuna_distributions(space),
-        metric=METRIC,
-        mode="min",
-        points_to_evaluate=[space.baseline],
-        sampler=TPESampler(seed=study.seeds.search, multivariate=True, constant_liar=True),
-        study_name=study.name,
-        storage=journal,
-        max_updates=study.training.updates,
-    )
-    _search(session, "adaptive", study.search.adaptive_trials, sampler, {})
+    Every trial of a search was measured at the first rung. What the search spent beyond that pays for the full training
+    of the trials that are best there; those of them that ASHA stopped are trained to the end.
+    """
+    names = [name for name in session.study.stages if name in _searches_read(session, stage)]
+    chosen = {name: _best_at_first_rung(session, name) for name in names}
+    to_train = [record for name in names for record in chosen[name]["kept"] if record.outcome == "stopped"]
+    jobs = [trial_job(session, stage, number, record.parameters) for number, record in enumerate(to_train)]
+    train_all(session, stage, jobs, session.study.training)
+    ends = {job.name: record.id for job, record in zip(jobs, to_train, strict=True)}
+    strategies = {}
+    for name in names:
+        records = session.run.trials_of(name)
+        strategies[f"{name}, ASHA"] = _by_asha(records)
+        strategies[f"{name}, a little each"] = _by_little_each(session, stage, chosen[name], ends)
+    shares = {name: spent_updates(session.run.trials_of(name), session.study.training.updates) for name in names}
+    return {"references": {"strategies": strategies, "asha_share": shares}}
 
 
-def run_jobs(session: Session, jobs: Sequence[Job], stage: str, training: TrainingConfig) -> None:
+def train_all(session: Session, stage: str, jobs: Sequence[Job], training: TrainingConfig) -> None:
     """Train every job to the full budget of `training`."""
-    from ray.tune.schedulers import FIFOScheduler
-    from ray.tune.search.basic_variant import BasicVariantGenerator
-
-    jobs = list(jobs)
     session.observer.on_stage(stage, len(jobs), training.updates)
-    _fit(
-        session,
-        stage,
-        training,
-        job_of=lambda name, parameters: jobs[parameters["job"]],
-        name_of=lambda trial: jobs[trial.config["job"]].name,
-        param_space={"job": _grid(range(len(jobs)))},
-        metric={"metric": METRIC, "mode": "min"},
-        num_samples=1,
-        scheduler=FIFOScheduler(),
-        search_alg=BasicVariantGenerator(),
+    queue = TrialQueue(jobs, training.updates, NothingStops(), session.observers(mirrored=False))
+    if any(not TrialFolder(job.folder).ended for job in jobs):
+        session.start_pool().run(queue, stage, training)
+
+
+def recorded_parameters(run: RunFolder, stage: str, number: int) -> dict | None:
+    """Parameters of a trial that has begun; None for one that has not."""
+    folder = run.trial(trial_name(stage, number))
+    return read_json(folder.path / "config.json")["parameters"] if folder.started else None
+
+
+def trial_name(stage: str, number: int) -> str:
+    """Id of a stage's trial."""
+    return f"{stage}_{number:04d}"
+
+
+def trial_job(session: Session, stage: str, number: int, parameters: Mapping, init_seed: int | None = None) -> Job:
+    """A trial of a stage, with the seed that all trials of searches share unless another is given."""
+    name = trial_name(stage, number)
+    return Job(
+        folder=session.run.trial(name).path.absolute(),
+        name=name,
+        parameters=dict(parameters),
+        init_seed=session.study.seeds.init if init_seed is None else init_seed,
     )
 
 
-def _search(session: Session, stage: str, num_trials: int, sampler, param_space: dict) -> None:
-    from cconv.study.asha import RecordedASHA
-
+def _search(session: Session, stage: str, jobs: Iterator[Job], num_trials: int) -> None:
     study, run = session.study, session.run
-    scheduler = RecordedASHA(
-        run.path / "rungs.json",
-        stage,
-        max_updates=study.training.updates,
-        grace_updates=study.search.grace_updates,
-        reduction_factor=study.search.reduction_factor,
-        metric=METRIC,
-        give_up_above=study.search.give_up_above,
-    )
-    init_seed, numbers = study.seeds.init, count()
-
-    def job_of(name: str, parameters: dict) -> Job:
-        return Job(folder=run.trial(name).path, name=name, parameters=parameters, init_seed=init_seed)
-
+    file = RungFile(run.path / "rungs.json")
+    table = file.table(stage, study.rungs, study.search.reduction_factor)
+    judge = StopsByRungs(file, stage, table, study.search.give_up_above)
     session.observer.on_stage(stage, num_trials, study.training.updates)
-    _fit(
-        session,
-        stage,
-        study.training,
-        job_of=job_of,
-        name_of=lambda trial: f"{stage}_{next(numbers):04d}",
-        param_space=param_space,
-        metric={},  # the scheduler and the sampler have it
-        num_samples=num_trials,
-        scheduler=scheduler,
-        search_alg=sampler,
-    )
+    queue = TrialQueue(jobs, study.training.updates, judge, session.observers(mirrored=True))
+    session.start_pool().run(queue, stage, study.training)
 
 
-def _fit(
-    session: Session,
-    stage: str,
-    training: TrainingConfig,
-    *,
-    job_of: Callable[[str, dict], Job],
-    name_of: Callable[..., str],
-    param_space: dict,
-    metric: dict,
-    **tune_settings,
-) -> None:
-    from ray import tune
-
-    from cconv.study.recorder import Recorder
-
-    study = session.study
-
-    def trainable(parameters: dict, shared: dict) -> None:
-        job = shared["job_of"](tune.get_context().get_trial_name(), parameters)
-        _train_and_report(job, stage, training, shared["problem"], shared["study"])
-
-    shared = {"job_of": job_of, "problem": session.problem, "study": study}
-    tuner = tune.Tuner(
-        tune.with_resources(tune.with_parameters(trainable, shared=shared), {"cpu": 1}),
-        param_space=param_space,
-        tune_config=tune.TuneConfig(
-            max_concurrent_trials=study.concurrency,
-            reuse_actors=True,
-            trial_name_creator=name_of,
-            trial_dirname_creator=lambda trial: trial.trial_id,
-            **metric,
-            **tune_settings,
-        ),
-        run_config=tune.RunConfig(
-            name=stage,
-            storage_path=str(session.ray_folder),
-            callbacks=[Recorder(session.observer, job_of, stage, training.updates)],
-            progress_reporter=_silent_reporter(),
-            verbose=0,
-        ),
-    )
-    tuner.fit()
+def _searches_read(session: Session, stage: str) -> set[str]:
+    return {record.stage for record in session.read(stage)}
 
 
-def _train_and_report(job: Job, stage: str, training: TrainingConfig, problem: Problem, study: StudyConfig) -> None:
-    import torch
-    from ray import tune
-
-    from cconv.study.trial import run_trial
-
-    torch.set_num_threads(1)
-    cache_megabytes = training.cache_megabytes // study.concurrency
-    folder = TrialFolder(job.folder)
-    trial = run_trial(
-        problem,
-        job.parameters,
-        study.network,
-        training.model_copy(update={"cache_megabytes": cache_megabytes}),
-        folder,
-        stage=stage,
-        init_seed=job.init_seed,
-        data_seed=study.seeds.data,
-        provenance=provenance(study),
-    )
-    try:
-        for entry in trial:
-            tune.report(entry | {METRIC: DIVERGED_ERROR if entry["diverged"] else entry[METRIC]})
-    except Exception as error:
-        folder.finish("failed", str(error) or type(error).__name__)
-        raise
+def _best_at_first_rung(session: Session, search: str) -> dict:
+    """Number of trials of a search, and those that are best at its first rung, as many as its budget pays for."""
+    full, first = session.study.training.updates, session.study.rungs[0]
+    records = session.run.trials_of(search)
+    spent = sum(record.log[-1]["updates"] for record in records if record.log)
+    at_first = {
+        record.id: entry["valid_normalized_mse"]
+        for record in records
+        for entry in record.log
+        if entry["updates"] == first and entry["valid_normalized_mse"] is not None
+    }
+    affordable = max(1, int((spent - len(records) * first) // max(full - first, 1)))
+    best = sorted(at_first, key=at_first.__getitem__)[:affordable]
+    return {"trials": len(records), "kept": [record for record in records if record.id in best]}
 
 
-def _grid(values):
-    from ray import tune
+def _by_asha(records: Sequence[TrialRecord]) -> dict:
+    """What the search itself spent and found."""
+    curve = best_so_far(records)
+    return {
+        "updates": sum(record.log[-1]["updates"] for record in records if record.log),
+        "best_valid": curve[-1][1] if curve else None,
+        "curve": [list(point) for point in curve],
+    }
 
-    return tune.grid_search(list(values))
 
-
-def _silent_reporter():
-    from ray.tune import ProgressReporter
-
-    class Silent(ProgressReporter):
-        def should_report(self, trials, done=False):
-            return False
-
-        def report(self, trials, done, *sys_info):
-            return None
-
-    return Silent()
+def _by_little_each(session: Session, stage: str, chosen: dict, ends: Mapping[str, str]) -> dict:
+    """What the kept trials reached: each trial a little, then those that were best, one after another."""
+    first, full = session.study.rungs[0], session.study.training.updates
+    trained = {ends[record.id]: record for record in session.run.trials_of(stage) if record.id in ends}
+    finals = [trained.get(record.id, record) for record in chosen["kept"]]
+    spent, best, curve = chosen["trials"] * first, math.inf, []
+    for record in finals:
+        spent += full - first
+        if record.outcome == "completed" and record.last:
+            best = min(best, record.last["valid_normalized_mse"])
+            curve.append([spent, best])
+    return {"updates": spent, "best_valid": best if curve else None, "curve": curve}

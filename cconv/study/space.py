@@ -1,100 +1,41 @@
-"""Search spaces: which hyperparameters vary, over what, and why. TOML, validated; see search_spaces/README.md."""
+"""Search spaces: which hyperparameters vary, over what, when, and why. TOML, validated; see search_spaces/README.md."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from cconv.errors import ConfigError, did_you_mean
 from cconv.study.config import TrainingConfig, read_toml
+from cconv.study.domains import Choice, FloatRange, IntRange, Parameter, SearchSpace, Value, fixed, narrowed
 from cconv.training.field_model import NetworkConfig
-from cconv.validation import StrictModel, validated
+from cconv.validation import validated
 
-Value = bool | int | float | str
+__all__ = [
+    "HYPERPARAMETERS",
+    "Choice",
+    "FloatRange",
+    "IntRange",
+    "Parameter",
+    "SearchSpace",
+    "Value",
+    "check_baseline_affordable",
+    "configure",
+    "fixed",
+    "load_space",
+    "narrowed",
+]
 
 TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
 HYPERPARAMETERS = (*NetworkConfig.model_fields, *TRAINING_HYPERPARAMETERS)
-
-
-class Choice(StrictModel):
-    """One of a few values, without order."""
-
-    type: Literal["choice"]
-    values: list[Value] = Field(min_length=1)
-    baseline: Value
-    reason: str
-
-    @model_validator(mode="after")
-    def _baseline_is_listed(self) -> "Choice":
-        if self.baseline not in self.values:
-            raise ValueError(f"the baseline {self.baseline!r} must be one of the values {self.values}")
-        return self
-
-    @property
-    def extremes(self) -> list[Value]:
-        """Values that must all be possible."""
-        return self.values
-
-
-class _Range(StrictModel):
-    scale: Literal["linear", "log"] = "linear"
-    reason: str
-
-    @model_validator(mode="after")
-    def _baseline_is_inside(self):
-        low, high = self.range
-        if not low < high:
-            raise ValueError(f"the range [{low}, {high}] must have its lower end first")
-        if self.scale == "log" and low <= 0:
-            raise ValueError(f"the range [{low}, {high}] must be positive on a log scale")
-        if not low <= self.baseline <= high:
-            raise ValueError(f"the baseline {self.baseline} must lie in the range [{low}, {high}]")
-        return self
-
-    @property
-    def extremes(self) -> list[Value]:
-        """Values that must all be possible."""
-        return list(self.range)
-
-
-class IntRange(_Range):
-    """A whole number, both ends included."""
-
-    type: Literal["int"]
-    range: tuple[int, int]
-    baseline: int
-
-
-class FloatRange(_Range):
-    """A real number."""
-
-    type: Literal["float"]
-    range: tuple[float, float]
-    baseline: float
-
-
-Parameter = Annotated[Choice | IntRange | FloatRange, Field(discriminator="type")]
-
-
-class SearchSpace(StrictModel):
-    """A named set of hyperparameters and their domains."""
-
-    name: str
-    description: str
-    parameters: dict[str, Parameter] = Field(min_length=1)
-
-    @property
-    def baseline(self) -> dict[str, Value]:
-        """Baseline value of every parameter."""
-        return {name: parameter.baseline for name, parameter in self.parameters.items()}
 
 
 def load_space(path: Path | str) -> SearchSpace:
     """Search space from a TOML file.
 
     Raises:
-        ConfigError: If the file cannot be read, names no hyperparameter of ours, or a value is impossible.
+        ConfigError: If the file cannot be read, names no hyperparameter of ours, or a value, condition or the baseline
+            is impossible.
     """
     space = validated(SearchSpace, read_toml(path), path)
     for name, parameter in space.parameters.items():
@@ -104,16 +45,37 @@ def load_space(path: Path | str) -> SearchSpace:
                 f"Known: {', '.join(HYPERPARAMETERS)}."
             )
         for value in parameter.extremes:
-            _check_possible(name, value, path)
+            _check_possible({name: value}, f"{path}: `parameters.{name}`: the value {value!r}")
+    _check_possible(space.baseline, f"{path}: the baseline")
     return space
 
 
-def _check_possible(name: str, value: Value, path: Path | str) -> None:
+def _check_possible(parameters: Mapping[str, Value], what: str) -> None:
     try:
-        configure({name: value}, NetworkConfig(), TrainingConfig())
+        configure(parameters, NetworkConfig(), TrainingConfig())
     except ValidationError as error:
-        problem = error.errors()[0]["msg"]
-        raise ConfigError(f"{path}: `parameters.{name}`: the value {value!r} is not possible ({problem}).") from error
+        raise ConfigError(f"{what} is not possible ({error.errors()[0]['msg']}).") from error
+
+
+def check_baseline_affordable(space: SearchSpace, flops_of: Callable[[Mapping[str, Value]], float]) -> None:
+    """Refuse a space whose own baseline costs more than its cap, once the scene is known.
+
+    Args:
+        space: The search space.
+        flops_of: Multiplications and additions of one particle's prediction by a configuration.
+
+    Raises:
+        ConfigError: If the baseline is above the cap.
+    """
+    cap = space.max_flops_per_particle
+    if cap is None:
+        return
+    cost = flops_of(space.baseline)
+    if cost > cap:
+        raise ConfigError(
+            f"search space {space.name!r}: its baseline costs {cost:.3g} FLOPs per particle in this scene, above "
+            f"`max_flops_per_particle` = {cap:.3g}; raise the cap or take a cheaper baseline."
+        )
 
 
 def configure(
@@ -126,34 +88,3 @@ def configure(
         NetworkConfig.model_validate(network.model_dump() | shape),
         TrainingConfig.model_validate(training.model_dump() | drawn),
     )
-
-
-def ray_domains(space: SearchSpace) -> dict:
-    """The space as Ray Tune domains."""
-    from ray import tune
-
-    makers = {
-        ("int", "linear"): lambda low, high: tune.randint(low, high + 1),
-        ("int", "log"): lambda low, high: tune.lograndint(low, high + 1),
-        ("float", "linear"): tune.uniform,
-        ("float", "log"): tune.loguniform,
-    }
-    return {
-        name: tune.choice(parameter.values)
-        if isinstance(parameter, Choice)
-        else makers[parameter.type, parameter.scale](*parameter.range)
-        for name, parameter in space.parameters.items()
-    }
-
-
-def optuna_distributions(space: SearchSpace) -> dict:
-    """The space as Optuna distributions."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    makers = {"int": IntDistribution, "float": FloatDistribution}
-    return {
-        name: CategoricalDistribution(parameter.values)
-        if isinstance(parameter, Choice)
-        else makers[parameter.type](*parameter.range, log=parameter.scale == "log")
-        for name, parameter in space.parameters.items()
-    }

@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 
+from cconv.evaluation.cost import flops_per_particle
 from cconv.study.config import TrainingConfig
 from cconv.study.problem import Problem
 from cconv.study.records import TrialFolder
 from cconv.study.space import configure
-from cconv.training.checkpoint import save_model
-from cconv.training.field_model import NetworkConfig
+from cconv.training.checkpoint import read_card, save_model
+from cconv.training.field_model import FieldModel, NetworkConfig
 from cconv.training.loop import TrainingState, train
+from cconv.training.progress import Progress, begin, load_progress, save_progress
 
 
 def run_trial(
@@ -23,23 +25,26 @@ def run_trial(
     init_seed: int,
     data_seed: int,
     provenance: Mapping,
+    seconds_limit: float = math.inf,
     on_update: Callable[[TrainingState], None] = lambda state: None,
 ) -> Iterator[dict]:
-    """Train one configuration; yields an entry at every evaluation, after it is on disk.
+    """Train one configuration, from where an earlier process left it; yields an entry at every evaluation.
 
-    The checkpoint of the folder is the model of the best validation error so far; on Ctrl-C before the first evaluation
-    it is the model as it stands. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
+    Everything is on disk before an entry is yielded: the log, the progress from which a killed training goes on, and
+    the checkpoint of the best validation error so far; on Ctrl-C before the first evaluation the checkpoint is the
+    model as it stands. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
 
     Args:
         problem: Scene, task and samples.
         parameters: Hyperparameters that replace those of `network` and `training`.
         network: The study's network settings.
         training: The study's training settings.
-        folder: Where config.json, log.jsonl and checkpoint/ are written.
+        folder: Where config.json, log.jsonl, progress.safetensors and checkpoint/ are written.
         stage: Stage that the trial belongs to.
         init_seed: Seed of the initial weights.
         data_seed: Seed of the batch order.
         provenance: Where the data come from, for the checkpoint's card.
+        seconds_limit: Time that the training may take in all; it ends at the first update after that.
         on_update: Sees the state after every update.
     """
     network, training = configure(parameters, network, training)
@@ -52,10 +57,11 @@ def run_trial(
         "init_seed": init_seed,
         "data_seed": data_seed,
         "num_parameters": model.num_parameters,
+        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
     }
-    folder.start(config)
+    progress = _begin_or_go_on(model, folder, config)
     card = config | dict(provenance)
-    best = math.inf
+    best = _best_so_far(folder)
     states = train(
         model,
         problem.train_samples,
@@ -67,22 +73,41 @@ def run_trial(
         schedule=training.schedule,
         data_seed=data_seed,
         cache_bytes=training.cache_megabytes * 2**20,
+        progress=progress,
     )
     try:
         for state in states:
             on_update(state)
             if state.valid_normalized_mse is None and not state.diverged:
+                if state.seconds > seconds_limit:
+                    return
                 continue
             entry = _entry(state)
-            folder.append(entry)
             if not state.diverged and state.valid_normalized_mse < best:
                 best = state.valid_normalized_mse
                 save_model(model, folder.checkpoint, card | {"valid_normalized_mse": best, "updates": state.updates})
+            folder.append(entry)
+            save_progress(folder.progress, model, progress)
             yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
             save_model(model, folder.checkpoint, card | {"valid_normalized_mse": None})
         raise
+
+
+def _begin_or_go_on(model: FieldModel, folder: TrialFolder, config: Mapping) -> Progress:
+    if not folder.progress.is_file():
+        folder.start(config)
+        return begin(model)
+    progress = load_progress(folder.progress, model)
+    folder.go_on(progress.updates)
+    return progress
+
+
+def _best_so_far(folder: TrialFolder) -> float:
+    """Validation error of the checkpoint of an earlier process; infinity where there is none."""
+    known = read_card(folder.checkpoint).get("valid_normalized_mse") if folder.progress.is_file() else None
+    return math.inf if known is None else known
 
 
 def _entry(state: TrainingState) -> dict:

@@ -9,7 +9,14 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
 
-from cconv.data.features import Inputs, Standardization, fluid_state, make_inputs, standardize_features
+from cconv.data.features import (
+    Inputs,
+    Standardization,
+    fluid_state,
+    inputs_without_density,
+    make_inputs,
+    standardize_features,
+)
 from cconv.data.features import standardize_vectors as standardize_targets
 from cconv.data.targets import VECTOR_TASKS, Sample, target_channels
 from cconv.data.trajectory import Frame, Scene
@@ -29,7 +36,8 @@ class NetworkConfig(BaseModel):
     `relative_cutoff` is the filter radius R in particle spacings (published: diameter 0.225 = 1.5·6·0.025 at spacing
     0.05, so R = 2.25 spacings). The layers have `first_channels`, then `hidden_channels`, and the target's components;
     a RadialNet has so many scalars and as many vectors. `kernel_size`, `mapping`, `interpolation`, `align_corners` and
-    `initialization` are the grid's, `radial_terms` is the radial basis's.
+    `initialization` are the grid's, `radial_terms` is the radial basis's. Without `boundary` a model has no boundary
+    branch, even in a scene with walls; without `density` its features are [1, v].
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -52,6 +60,8 @@ class NetworkConfig(BaseModel):
     activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
+    boundary: bool = True
+    density: bool = True
 
     @model_validator(mode="after")
     def _skip_fits_basis(self) -> "NetworkConfig":
@@ -68,7 +78,7 @@ class NetworkConfig(BaseModel):
 class FieldConfig(BaseModel):
     """Everything that rebuilds a model except its weights; stored as `config.json`.
 
-    Lengths are in the units of the data.
+    Lengths are in the units of the data. `boundary_channels` is 0 for a model without a boundary branch.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -80,6 +90,11 @@ class FieldConfig(BaseModel):
     smoothing_length: float = Field(gt=0)
     boundary_channels: int = Field(ge=0)
     network: NetworkConfig
+
+    @property
+    def feature_channels(self) -> int:
+        """Features of a fluid particle: [1, v, ρ] or [1, v]."""
+        return self.dim + 1 + self.network.density
 
 
 @dataclass(frozen=True)
@@ -105,7 +120,7 @@ class FieldModel(nn.Module):
 
     Args:
         config: What to build.
-        features: Standardisation of the fluid features, from the training split.
+        features: Standardisation of the fluid features that the model takes, from the training split.
         targets: Standardisation of the target, from the training split.
         generator: Source of the initial weights; None for torch's global one.
     """
@@ -159,9 +174,11 @@ class FieldModel(nn.Module):
 
     def network_inputs(self, inputs: Inputs, geometry: FieldGeometry) -> tuple:
         """What the network takes: standardised features and geometry of the fluid, then of the boundary."""
-        features = (inputs.features - self.feature_mean) / self.feature_scale
+        channels = self.config.feature_channels
+        features = (inputs.features[:, :channels] - self.feature_mean) / self.feature_scale
         if self.config.network.basis == "radial":
-            features = torch.cat([features[:, :1], features[:, -1:], features[:, 1:-1]], dim=1)  # scalars come first
+            one, velocity, rho = features.tensor_split((1, self.config.dim + 1), dim=1)
+            features = torch.cat([one, rho, velocity], dim=1)  # scalars come first
         boundary = (inputs.boundary_features, geometry.boundary) if geometry.boundary is not None else ()
         return features, geometry.fluid, *boundary
 
@@ -176,6 +193,8 @@ class FieldModel(nn.Module):
 
     def predict_frame(self, frame: Frame, box: Box) -> Tensor:
         """Field (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
+        if not self.config.network.density:
+            return self.predict(inputs_without_density(frame, box))
         return self.predict(make_inputs(fluid_state(frame, box, self.kernel), frame.boundary, box))
 
     def _conv_geometry(self, edges: Edges) -> ConvGeometry | RadialGeometry:
@@ -187,7 +206,12 @@ class FieldModel(nn.Module):
                 f"The model is for {self.config.dim} dimensions, the data have {inputs.positions.shape[1]}; "
                 "use a checkpoint that was trained on such a scene."
             )
-        channels = 0 if inputs.boundary_features is None else inputs.boundary_features.shape[1]
+        if inputs.features.shape[1] < self.config.feature_channels:
+            raise ShapeError(
+                f"The model expects {self.config.feature_channels} features [1, v, ρ], the inputs have "
+                f"{inputs.features.shape[1]}; give it inputs with density."
+            )
+        channels = _boundary_channels(self.config.network, inputs)
         if channels != self.config.boundary_channels:
             raise ShapeError(
                 f"The model expects {self.config.boundary_channels} boundary features, the data have {channels}; "
@@ -195,10 +219,15 @@ class FieldModel(nn.Module):
             )
 
 
+def _boundary_channels(network: NetworkConfig, inputs: Inputs) -> int:
+    """Features of a boundary point that a network takes; 0 if it takes none."""
+    return 0 if inputs.boundary_features is None or not network.boundary else inputs.boundary_features.shape[1]
+
+
 def _grid_network(config: FieldConfig, generator: torch.Generator | None) -> ConvNet:
     network = config.network
     return ConvNet(
-        config.dim + 2,
+        config.feature_channels,
         (*network.hidden_widths, target_channels(config.task, config.dim)),
         network.kernel_size,
         config.dim,
@@ -216,7 +245,7 @@ def _radial_network(config: FieldConfig, generator: torch.Generator | None) -> R
     is_vector = config.task in VECTOR_TASKS
     has_normals = config.boundary_channels == config.dim
     return RadialNet(
-        (2, 1),
+        (1 + network.density, 1),
         (*((width, width) for width in network.hidden_widths), (0, 1) if is_vector else (1, 0)),
         network.radial_terms,
         config.dim,
@@ -258,14 +287,13 @@ def build_field_model(
     generator: torch.Generator | None = None,
 ) -> FieldModel:
     """A fresh model for a scene, standardised by its training samples only."""
-    boundary = train_samples[0].inputs.boundary_features
     config = FieldConfig(
         task=task,
         dim=scene.dim,
         particle_spacing=scene.particle_spacing,
         kernel=kernel_name,
         smoothing_length=smoothing_length,
-        boundary_channels=0 if boundary is None else boundary.shape[1],
+        boundary_channels=_boundary_channels(network, train_samples[0].inputs),
         network=network,
     )
     # Shifted vectors would not turn with the scene, as all of a RadialNet does.
@@ -273,4 +301,4 @@ def build_field_model(
     features = standardize_features((sample.inputs.features for sample in train_samples), center_velocity=not turns)
     center = not (turns and task in VECTOR_TASKS)
     targets = standardize_targets((sample.target for sample in train_samples), center)
-    return FieldModel(config, features, targets, generator)
+    return FieldModel(config, features.first(config.feature_channels), targets, generator)

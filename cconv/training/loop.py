@@ -15,6 +15,7 @@ from cconv.evaluation.metrics import frame_errors, normalized_mse
 from cconv.training.batches import batches
 from cconv.training.field_model import FieldModel
 from cconv.training.geometry_cache import GeometryCache
+from cconv.training.progress import Progress, begin
 
 SCHEDULES = {
     "constant": lambda progress: 1.0,
@@ -56,6 +57,7 @@ def train(
     schedule: str = "cosine",
     data_seed: int = 0,
     cache_bytes: int = 2**31,
+    progress: Progress | None = None,
 ) -> Iterator[TrainingState]:
     """Train `model` in place; yields after every update, so that the caller decides when to stop and what to keep.
 
@@ -70,29 +72,32 @@ def train(
         schedule: "constant", "cosine" or "exponential"; the latter two fall to 1 %.
         data_seed: Seed of the batch order.
         cache_bytes: Memory for the geometries of frames, at most.
+        progress: Where an earlier training of the same model and settings stands, from where it goes on as if it had
+            not been interrupted; moved on in place. None begins.
 
     Raises:
         ConfigError: If the schedule is unknown.
     """
     check_choice("schedule", schedule, SCHEDULES)
-    start = time.perf_counter()
-    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    progress = progress or begin(model)
+    start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
-    order = islice(batches(len(train_samples), batch_size, data_seed), updates)
-    for update, indices in enumerate(order, start=1):
+    order = islice(batches(len(train_samples), batch_size, data_seed), progress.updates, updates)
+    for update, indices in enumerate(order, start=progress.updates + 1):
         rate = learning_rate * SCHEDULES[schedule]((update - 1) / updates)
-        optimizer.param_groups[0]["lr"] = rate
-        loss = _update(model, [train_samples[index] for index in indices], optimizer, geometry)
+        progress.optimizer.param_groups[0]["lr"] = rate
+        loss = _update(model, [train_samples[index] for index in indices], progress.optimizer, geometry)
         valid = None
         if math.isfinite(loss) and (update % evaluate_every == 0 or update == updates):
             valid = normalized_mse(frame_errors(model, valid_samples, geometry))
         diverged = not math.isfinite(loss) or (valid is not None and not math.isfinite(valid))
+        progress.updates, progress.seconds = update, time.perf_counter() - start
         yield TrainingState(
             updates=update,
             train_loss=loss,
             learning_rate=rate,
             valid_normalized_mse=valid,
-            seconds=time.perf_counter() - start,
+            seconds=progress.seconds,
             diverged=diverged,
         )
         if diverged:

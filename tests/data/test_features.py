@@ -2,7 +2,13 @@ import pytest
 import torch
 from systems import kernel, periodic_frame, periodic_scene, with_walls
 
-from cconv.data.features import fluid_state, make_inputs, standardize_features, standardize_vectors
+from cconv.data.features import (
+    fluid_state,
+    inputs_without_density,
+    make_inputs,
+    standardize_features,
+    standardize_vectors,
+)
 from cconv.data.trajectory import Frame, ParticleType
 
 
@@ -19,6 +25,15 @@ def test_features_are_one_velocity_density(state):
     torch.testing.assert_close(inputs.features[:, 1:3], state.velocities.float())
     torch.testing.assert_close(inputs.features[:, 3], state.densities.float())
     assert inputs.features.dtype == torch.float32
+
+
+def test_inputs_without_density_are_the_others_less_the_last_feature(generator):
+    scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
+    whole = make_inputs(fluid_state(frame, scene.box, kernel(scene)), frame.boundary, scene.box)
+    bare = inputs_without_density(frame, scene.box)
+    assert torch.equal(bare.features, whole.features[:, :-1])
+    for name in ("positions", "boundary_positions", "boundary_features"):
+        assert torch.equal(getattr(bare, name), getattr(whole, name))
 
 
 def test_density_of_a_jittered_lattice_is_near_one(state):

@@ -145,6 +145,48 @@ def test_gradients(message, generator):
     assert torch.autograd.gradgradcheck(lambda *inputs: convolve(fixed, *inputs), (features, *filters))
 
 
+def test_parts_of_a_geometry_keep_the_gradients_it_was_made_with(generator):
+    """Whatever the mode in which they are first asked for."""
+    positions = torch.rand(12, 2, generator=generator, dtype=torch.float64).requires_grad_()
+    layer = RadialConv((1, 1), (1, 1), 3, 2, generator=generator).double()
+    features = normal(generator, 12, 3)
+
+    def gradient(geometry):
+        return torch.autograd.grad(layer(features, geometry).sum(), positions)[0]
+
+    expected = gradient(RadialGeometry(radius_graph(positions, CUTOFF), 3, window="poly6"))
+    for mode in (torch.no_grad(), torch.inference_mode()):
+        geometry = RadialGeometry(radius_graph(positions, CUTOFF), 3, window="poly6")
+        with mode:
+            layer(features, geometry)
+            assert geometry.nbytes > 0  # asks for all parts
+        torch.testing.assert_close(gradient(geometry), expected)
+    fixed = RadialGeometry(radius_graph(positions, CUTOFF), 3, window="poly6", detach_positions=True)
+    assert not fixed.reads.requires_grad
+    assert not fixed.directions.requires_grad
+
+
+def test_prediction_equals_what_is_differentiated(generator):
+    """Two layers of few outputs: without gradients all of it takes another path."""
+    positions = torch.rand(80, 3, generator=generator, dtype=torch.float64)
+    network = RadialNet((2, 1), ((4, 4), (1, 0)), 6, 3, message="difference", generator=generator).double()
+    features, geometry = normal(generator, 80, 5), RadialGeometry(radius_graph(positions, CUTOFF), 6)
+    with torch.no_grad():
+        predicted = network(features, geometry)
+    torch.testing.assert_close(predicted, network(features, geometry).detach(), rtol=1e-12, atol=1e-12)
+
+
+def test_bias_is_added_to_scalars_alone(generator):
+    positions = torch.rand(20, 2, generator=generator, dtype=torch.float64)
+    layer = RadialConv((1, 1), (2, 1), 3, 2, generator=generator).double()
+    features, geometry = normal(generator, 20, 3), RadialGeometry(radius_graph(positions, CUTOFF), 3)
+    with torch.no_grad():
+        before = layer(features, geometry)
+        layer.bias.copy_(torch.tensor([1.0, -2.0]))
+        added = layer(features, geometry) - before
+    torch.testing.assert_close(added, torch.tensor([1.0, -2, 0, 0], dtype=torch.float64).expand(20, 4))
+
+
 def test_no_vectors_no_scalars_no_neighbours(generator):
     positions = torch.tensor([[0.0, 0], [5, 5]], dtype=torch.float64)
     geometry = RadialGeometry(radius_graph(positions, CUTOFF), 3)

@@ -1,96 +1,142 @@
+"""The report of whole, old, interrupted and failed runs."""
+
 import json
 import re
 import shutil
-import subprocess
-import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from summaries import explanation, whole_summary
 
-from cconv.report.page import write_report
-from cconv.report.plots import best_so_far_chart, learning_curves_chart, speed_accuracy_chart
-from cconv.report.tables import curves_table, finalists_table, trials_table
+from cconv.report import page
+from cconv.report.page import render_report, write_report
 from cconv.study.records import RunFolder
+
+SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
+OPTIONAL = (
+    "search_points", "analytic", "front", "growth", "rung_audit", "references", "importance", "ablation", "selection",
+    "initialization", "refined",
+)  # fmt: skip
+
+
+def old_run(folder):
+    """A run whose summary has no more than any version of the summary has."""
+    run = RunFolder(shutil.copytree(SAMPLE, folder / "run"))
+    summary = {key: value for key, value in run.read("summary.json").items() if key not in OPTIONAL}
+    for entry in summary["finalists"]:
+        entry["stability"] = None
+    run.write("summary.json", summary)
+    return run
 
 
 @pytest.fixture
-def run(finished_run):
-    return RunFolder.open(finished_run)
+def run(tmp_path):
+    return old_run(tmp_path)
 
 
-def test_trials_table_has_a_row_a_trial_and_its_hyperparameters(run):
-    table = trials_table(run)
-    assert list(table["trial"]) == [record.id for record in run.trials()]
-    assert {"kernel_size", "message", "learning_rate", "outcome", "num_parameters"} <= set(table.columns)
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    """A run with everything that can be recorded."""
+    run = old_run(tmp_path_factory.mktemp("whole"))
+    run.write("summary.json", whole_summary(run.read("summary.json")))
+    (run.path / "explanation").mkdir(exist_ok=True)
+    for name in {run.read("summary.json")["recommended"]["id"], "baseline"}:
+        np.savez(run.path / "explanation" / f"{name}.npz", **explanation())
+    return run
 
 
-def test_curves_table_has_a_row_an_evaluation(run):
-    table = curves_table(run)
-    records = [*run.trials(), *(record for records in run.retrainings().values() for record in records)]
-    assert len(table) == sum(len(record.log) for record in records)
-    assert (table["valid_normalized_mse"] > 0).all()
+@pytest.fixture(scope="module")
+def whole_report(whole_run):
+    return write_report(whole_run).read_text()
 
 
-def test_finalists_table_is_sorted_by_error(run):
-    table = finalists_table(run.read("summary.json"))
-    assert table["normalized_mse"].is_monotonic_increasing
-    assert (table["ci95_low"] <= table["normalized_mse"]).all()
+def without_scripts(text):
+    return re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
 
 
-def test_speed_accuracy_chart_has_log_axes_every_finalist_and_the_front(run):
+def sections(text):
+    return re.findall(r'<h2 id="(\w+)"', text)
+
+
+def test_old_summaries_have_a_report(run):
+    text = write_report(run).read_text()
     summary = run.read("summary.json")
-    (axes,) = speed_accuracy_chart(summary).axes
-    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    labels = " ".join(text.get_text() for text in axes.texts)
-    assert all(entry["id"] in labels for entry in summary["finalists"])
-    assert "front" in axes.get_legend_handles_labels()[1]
-
-
-def test_other_charts_show_the_trials(run):
-    search, finals = learning_curves_chart(curves_table(run)).axes
-    assert len(search.lines) >= len(run.trials())
-    assert len(finals.lines) == sum(len(records) for records in run.retrainings().values())
-    assert best_so_far_chart(trials_table(run)).axes[0].get_yscale() == "log"
-
-
-def test_report_opens_without_a_network_and_states_the_figures(run):
-    page = write_report(run).read_text()
-    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
-    assert page.count("data:image/png;base64,") == 3
-    summary = run.read("summary.json")
-    assert summary["recommended"]["reason"].split(" (")[0] in page
+    assert summary["recommended"]["reason"].split(" (")[0] in text
     for entry in summary["finalists"]:
-        assert f"{entry['test']['normalized_mse']:.4g}" in page
+        assert f"{entry['test']['normalized_mse']:.4g}" in text
+    assert sections(text) == ["answer", "chart", "finalists", "cost", "search", "provenance", "glossary"]
 
 
-def test_a_run_whose_baseline_failed_has_a_report_that_says_so(run, tmp_path):
-    shutil.copytree(run.path, tmp_path / "lame")
+def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
+    assert sections(whole_report) == [
+        "answer", "chart", "finalists", "sure", "stability", "cost", "search", "importance", "ablation", "learned",
+        "provenance", "glossary",
+    ]  # fmt: skip
+    for figure in ("7.52 (7.21 to 7.93)", "22.4 %", "4.21", "1.03", "loses good trials", "less accurate than the"):
+        assert figure in whole_report
+
+
+def test_each_optional_part_can_be_missing(run, whole_run, monkeypatch):
+    monkeypatch.setattr(page, "_picture", lambda figure: "")
+    monkeypatch.setattr(page, "interactive_html", lambda summary: "")
+    summary = whole_run.read("summary.json")
+    for key in [*OPTIONAL, "failed_finalists"]:
+        run.write("summary.json", {name: value for name, value in summary.items() if name != key})
+        assert "answer" in sections(render_report(run))
+
+
+def test_every_section_says_what_is_to_be_seen_and_every_link_has_its_place(whole_report):
+    text = without_scripts(whole_report)
+    parts = re.split(r"<h[23][^>]*>", text)[1:]
+    assert all(re.search(r"<(p|dl|div)[ >]", part) for part in parts)
+    targets = set(re.findall(r'href="#(\w+)"', text))
+    assert targets <= set(sections(text))
+
+
+def test_a_report_opens_without_a_network(whole_report):
+    assert not re.findall(r"""<(?:script|link|img)[^>]+(?:src|href)=["'](?!data:)""", whole_report)
+    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)""", without_scripts(whole_report))
+    assert whole_report.count("plotly.js v") <= 1
+
+
+def test_what_was_recorded_cannot_write_html(run):
+    summary = run.read("summary.json")
+    summary["recommended"]["reason"] = "<script>alert('it')</script>"
+    run.write("summary.json", summary)
+    assert "<script>alert" not in write_report(run).read_text()
+
+
+def test_a_run_whose_baseline_failed_has_a_report_that_says_so(run):
     summary = run.read("summary.json")
     summary["finalists"] = [entry for entry in summary["finalists"] if entry["id"] != "baseline"]
     other = summary["finalists"][0]["id"]
     summary |= {"pareto_front": [other], "recommended": {"id": other, "reason": "alone"}}
     summary["failed_finalists"] = {"baseline": "seed_1 failed out of memory"}
-    (tmp_path / "lame" / "summary.json").write_text(json.dumps(summary))
-    assert "seed_1 failed out of memory" in write_report(RunFolder.open(tmp_path / "lame")).read_text()
+    run.write("summary.json", summary)
+    assert "seed_1 failed out of memory" in write_report(run).read_text()
 
 
-def test_an_interrupted_run_has_a_report_too(run, tmp_path):
-    shutil.copytree(run.path, tmp_path / "cut")
-    (tmp_path / "cut" / "summary.json").unlink()
-    (tmp_path / "cut" / "state.json").write_text(json.dumps({"state": "interrupted", "stage": "finalists"}))
-    shutil.rmtree(tmp_path / "cut" / "finalists")
-    page = write_report(RunFolder.open(tmp_path / "cut")).read_text()
-    assert "interrupted" in page
-    assert page.count("data:image/png;base64,") == 2
+def test_an_interrupted_run_has_a_report_too(run):
+    (run.path / "summary.json").unlink()
+    run.write("state.json", {"state": "interrupted", "stage": "finalists"})
+    shutil.rmtree(run.path / "finalists")
+    text = write_report(run).read_text()
+    assert "interrupted" in text
+    assert text.count("data:image/png;base64,") == 2
+    assert sections(text) == ["search", "provenance", "glossary"]
 
 
 def test_a_run_without_any_trial_has_a_report_too(run, tmp_path):
+    empty = RunFolder(tmp_path / "empty")
     for name in ("study.json", "space.json"):
-        (tmp_path / name).write_text((run.path / name).read_text())
-    (tmp_path / "state.json").write_text(json.dumps({"state": "failed", "stage": "data"}))
-    assert "failed" in write_report(RunFolder.open(tmp_path)).read_text()
+        empty.write(name, run.read(name))
+    empty.write("state.json", {"state": "failed", "stage": "data"})
+    assert "failed" in write_report(empty).read_text()
 
 
-def test_tables_and_plots_need_neither_ray_nor_torch():
-    code = "import sys, cconv.report.tables, cconv.report.plots; print({'ray', 'torch'} & set(sys.modules))"
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert finished.stdout.strip() == "set()"
+def test_a_finished_study_has_a_report(finished_run):
+    summary = json.loads((finished_run / "summary.json").read_text())
+    text = write_report(RunFolder.open(finished_run)).read_text()
+    assert summary["recommended"]["id"] in text
+    assert f"{len(summary['finalists'])}" in text

@@ -7,7 +7,7 @@ import pytest
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
 from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.closed_form import STAGE, _draw, single_layers
+from cconv.study.closed_form import STAGE, _draw, _neighbors, single_layers
 from cconv.study.records import RunFolder
 from cconv.study.space import SearchSpace, load_space
 from cconv.training.field_model import NetworkConfig
@@ -74,10 +74,24 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
     assert card["test"]["ci95"] == entry["test"]["ci95"]
 
 
+def test_candidates_go_on_from_the_would_be_finalists(run):
+    """Of four candidates the last two are one change away from the best of those before them."""
+    records = run.trials_of(STAGE)
+    best = min(records[:2], key=lambda record: record.best)
+    for record in records[2:]:
+        parents = [best, *records[2:]]
+        assert any(record in _neighbors_of(parent, records) for parent in parents)
+
+
+def _neighbors_of(parent, records):
+    near = _neighbors(parent.parameters, [record.parameters for record in records])
+    return [record for record in records if record.parameters in near]
+
+
 def test_optuna_is_told_of_trained_trials_only(run):
     import optuna
 
-    from cconv.study.optuna_mirror import open_journal
+    from cconv.study.optuna_mirror import open_storage
 
-    study = optuna.load_study(study_name="smoke", storage=open_journal(run.path / "optuna.journal"))
-    assert len(study.trials) == 6
+    study = optuna.load_study(study_name="smoke", storage=open_storage(run.path / "optuna.journal"))
+    assert {trial.user_attrs["trial"].split("_")[0] for trial in study.trials} == {"random", "adaptive"}

@@ -47,9 +47,12 @@ def test_settings_replace_those_of_the_file(study_file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("random_trial = 5", r"study\.toml: unknown key `search\.random_trial`\. Did you mean 'random_trials'"),
-        ("random_trials = 0", r"study\.toml: `search\.random_trials`: .*greater than or equal to 1, got 0"),
-        ('random_trials = "many"', r"`search\.random_trials`: .*valid integer"),
+        ("grace_update = 5", r"study\.toml: unknown key `search\.grace_update`\. Did you mean 'grace_updates'"),
+        ("reduction_factor = 1", r"study\.toml: `search\.reduction_factor`: .*greater than or equal to 2, got 1"),
+        ('trial_seconds = "many"', r"`search\.trial_seconds`: .*valid number"),
+        ("[stages.random]\ntrials = 0", r"`stages\.random\.trials`: .*greater than or equal to 1, got 0"),
+        ("[stages.random]\ntrial = 3", r"unknown key `stages\.random\.trial`\. Did you mean 'trials'"),
+        ('[stages.random]\n[stages.refine]\nreads = ["rando"]', "`refine` names `rando`.* Did you mean 'random'"),
         ("[training]\nupdates = 10", "grace_updates .50. must not exceed"),
         ("grace_updates = 60", "multiple of"),
         ('[data]\nkernel = "cubic"', r"`data\.kernel`: must be one of cubic_spline"),

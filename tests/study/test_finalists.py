@@ -32,7 +32,7 @@ def test_every_finalist_gets_every_seed_after_the_searchs(run):
 def test_a_checkpoints_validation_error_is_the_best_of_its_log(run):
     retrain(run, "a", 1)
     retrain(run, "a", 2, errors=(0.2, 0.6))
-    (finalist,), failed = retrained_finalists(run, 2)
+    (finalist,), failed = retrained_finalists(run, ["a"], 2)
     assert finalist.valid_errors == [0.3, 0.2]
     assert finalist.best_checkpoint == run.finalist("a", 2).checkpoint
     assert failed == {}
@@ -44,7 +44,7 @@ def test_a_finalist_with_a_lost_seed_is_not_compared_and_said(outcome, run):
     retrain(run, "a", 2, outcome, "out of memory")
     retrain(run, "b", 1)
     retrain(run, "b", 2)
-    retrained, failed = retrained_finalists(run, 2)
+    retrained, failed = retrained_finalists(run, ["a", "b"], 2)
     assert [finalist.id for finalist in retrained] == ["b"]
     assert "seed_2" in failed["a"]
     assert outcome in failed["a"]
@@ -53,4 +53,4 @@ def test_a_finalist_with_a_lost_seed_is_not_compared_and_said(outcome, run):
 
 def test_a_finalist_with_too_few_seeds_is_not_compared(run):
     retrain(run, "a", 1)
-    assert retrained_finalists(run, 2) == ([], {"a": "only 1 of 2 seeds were trained"})
+    assert retrained_finalists(run, ["a"], 2) == ([], {"a": "only 1 of 2 seeds were trained"})

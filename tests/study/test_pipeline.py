@@ -10,9 +10,9 @@ from conftest import SCRIPT, SMOKE
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
 from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.optuna_mirror import open_journal
+from cconv.study.optuna_mirror import open_storage
 from cconv.study.records import RunFolder
-from cconv.study.space import SearchSpace
+from cconv.study.space import SearchSpace, fixed, load_space
 
 
 @pytest.fixture
@@ -25,26 +25,54 @@ def summary(run):
     return run.read("summary.json")
 
 
-def test_the_baseline_comes_first_in_both_searches(run):
+def test_the_baseline_is_trained_to_the_full_budget_and_is_a_finalist(run, summary):
     space = SearchSpace.model_validate(run.read("space.json"))
-    parameters = {record.id: record.parameters for record in run.trials()}
-    assert parameters["random_0000"] == space.baseline
-    assert parameters["adaptive_0000"] == space.baseline
+    (baseline,) = run.trials_of("baseline")
+    assert (baseline.outcome, baseline.parameters) == ("completed", fixed(space, "boundary").baseline)
+    assert summary["baseline"] in {entry["id"] for entry in summary["finalists"]}
 
 
 def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
     records = run.trials()
-    assert len(records) == 12
     assert all(record.outcome in ("completed", "stopped", "diverged") for record in records)
     counts = {stage: sum(outcomes.values()) for stage, outcomes in summary["trials"].items()}
-    assert counts == {"closed_form": 4, "initialization": 2, "random": 3, "adaptive": 3, "finalists": 5}
+    known = {"closed_form": 4, "initialization": 6, "baseline": 1, "random": 4, "adaptive": 3}
+    assert {stage: counts[stage] for stage in known} == known
+    assert sum(counts.values()) == len(records) + sum(len(each) for each in run.retrainings().values())
 
 
-def test_all_trials_share_data_seed_and_differ_in_nothing_else_than_parameters(run):
+def test_every_stage_left_what_it_found(run):
+    study = run.read("study.json")
+    assert [stage for stage in study["stages"] if not run.has_result(stage)] == []
+    assert run.result("select")["recommended"] == run.read("summary.json")["recommended"]["id"]
+
+
+def test_the_adaptive_stage_searches_the_refined_space(run):
+    refined = load_space(run.path / "stages" / "refine.toml")
+    assert all(refined.holds(record.parameters) for record in run.trials_of("adaptive"))
+    reasons = run.read("summary.json")["refined"]
+    assert set(reasons) >= set(refined.parameters)
+
+
+def test_every_trial_is_below_the_cap_on_cost(run):
+    cap = run.read("space.json")["max_flops_per_particle"]
+    assert all(record.config["flops_per_particle"] <= cap for record in run.trials())
+
+
+def test_all_trials_share_data_seed_and_searched_ones_their_initial_weights(run):
     records = run.trials()
     assert len({record.config["data_seed"] for record in records}) == 1
     searched = [record for record in records if record.stage != "initialization"]
     assert len({record.config["init_seed"] for record in searched}) == 1
+
+
+def test_the_reference_trains_what_the_search_stopped_with_what_the_search_spent(run, summary):
+    for name, strategy in summary["references"]["strategies"].items():
+        assert strategy["updates"] > 0, name
+    asha, little = (summary["references"]["strategies"][f"random, {name}"] for name in ("ASHA", "a little each"))
+    full = run.read("study.json")["training"]["updates"]
+    assert abs(little["updates"] - asha["updates"]) <= full
+    assert asha["best_valid"] == min(record.best for record in run.trials_of("random") if record.outcome == "completed")
 
 
 def test_rungs_hold_the_errors_of_the_logs(run):
@@ -59,9 +87,10 @@ def test_rungs_hold_the_errors_of_the_logs(run):
 
 def test_finalists_were_retrained_with_seeds_that_the_search_did_not_use(run):
     search_seed = run.read("study.json")["seeds"]["init"]
-    for records in run.retrainings().values():
+    for finalist, records in run.retrainings().items():
         seeds = [record.config["init_seed"] for record in records]
-        assert len(set(seeds)) == (1 if records[0].is_closed_form else 2)
+        once = records[0].is_closed_form or finalist.startswith("ablation_")
+        assert len(set(seeds)) == (1 if once else 2)
         assert search_seed not in seeds
 
 
@@ -98,14 +127,29 @@ def test_provenance_is_recorded(run, flow_folder):
 
 
 def test_optunas_journal_holds_both_searches_and_no_trial_without_an_end(run):
-    study = optuna.load_study(study_name="smoke", storage=open_journal(run.path / "optuna.journal"))
-    assert len(study.trials) == 6
+    study = optuna.load_study(study_name="smoke", storage=open_storage(run.path / "optuna.journal"))
+    assert len(study.trials) == 7
     assert all(trial.state.is_finished() for trial in study.trials)
 
 
 def test_nothing_half_written_remains(run):
     assert [path for path in run.path.rglob(".*")] == []
     assert json.loads((run.path / "state.json").read_text())["state"] == "finished"
+
+
+def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, summary):
+    path = summary["ablation"]["path"]
+    space = fixed(SearchSpace.model_validate(run.read("space.json")), "boundary")
+    if path:
+        assert path[0]["parameters"] == space.baseline
+        assert all(step["valid_normalized_mse"] > 0 for step in path)
+    (density,) = [entry for entry in summary["ablation"]["branches"] if entry["left_out"] == "density"]
+    assert density["valid_normalized_mse"] > 0
+
+
+def test_the_explanation_of_the_recommended_model_and_the_baseline_is_kept(run, summary):
+    kept = {path.stem for path in (run.path / "explanation").glob("*.npz")}
+    assert kept == {"baseline", summary["recommended"]["id"]}
 
 
 SPACE_WITH_FAILURES = """
@@ -119,21 +163,56 @@ baseline = 2.0
 reason = "The second fails."
 """
 
+STUDY_WITH_FAILURES = """
+name = "failures"
+task = "density_gradient"
+
+[network]
+layers = 2
+first_channels = 4
+
+[training]
+updates = 12
+evaluate_every = 6
+
+[search]
+space = "{space}"
+grace_updates = 6
+
+[stages.random]
+trials = 4
+
+[stages.finalists]
+
+[stages.select]
+
+[finalists]
+seeds = 2
+
+[cost]
+repeats = 3
+"""
+
 
 def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp_path):
-    """With no challenger at the full budget left, the baseline is compared with closed forms alone."""
+    """With no challenger at the full budget left, the baseline is alone. More trials go on from there."""
     (tmp_path / "space.toml").write_text(SPACE_WITH_FAILURES)
-    command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", tmp_path / "run"]
-    settings = [f"search.space={tmp_path / 'space.toml'}", "search.random_trials=6", "search.adaptive_trials=0"]
-    options = [part for setting in settings for part in ("--set", setting)]
-    finished = subprocess.run([*command, *options], capture_output=True, text=True, timeout=200)
+    (tmp_path / "failures.toml").write_text(STUDY_WITH_FAILURES.format(space=tmp_path / "space.toml"))
+    folder = tmp_path / "run"
+    command = [SCRIPT, "study", "run", tmp_path / "failures.toml", "--data", flow_folder, "--out", folder]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert finished.returncode == 0, finished.stderr
-    run = RunFolder.open(tmp_path / "run")
+    run = RunFolder.open(folder)
     failed = [record for record in run.trials() if record.outcome == "failed"]
     assert {record.parameters["relative_cutoff"] for record in failed} == {6.0}
     assert all("half of every periodic axis" in record.reason for record in failed)
-    summary = run.read("summary.json")
-    for stage in ("random", "closed_form"):
-        assert summary["trials"][stage]["failed"] == sum(record.stage == stage for record in failed) >= 1
-    trained = [entry["id"] for entry in summary["finalists"] if not entry["id"].startswith("closed_form")]
-    assert trained == ["baseline"]
+    assert run.read("summary.json")["trials"]["random"]["failed"] == len(failed) >= 1
+    assert [entry["id"] for entry in run.read("summary.json")["finalists"]] == ["baseline"]
+    before = {record.id: record.log for record in run.trials()}
+    command = [SCRIPT, "study", "extend", folder, "--stage", "random", "--trials", "3"]
+    extended = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert extended.returncode == 0, extended.stderr
+    after = {record.id: record.log for record in run.trials()}
+    assert len(after) == 7
+    assert {trial: log for trial, log in after.items() if trial in before} == before
+    assert run.read("state.json")["state"] == "finished"

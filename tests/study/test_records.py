@@ -3,13 +3,15 @@ import json
 import pytest
 
 from cconv.errors import ConfigError, DataError
-from cconv.study.records import RunFolder, write_json
+from cconv.study.records import FORMAT, RunFolder, write_json
 
 CONFIG = {"stage": "random", "parameters": {"kernel_size": 4}, "num_parameters": 12, "init_seed": 0}
+STUDY = {"format": FORMAT, "stages": {"random": {"kind": "random"}}}
 ENTRY = {"updates": 5, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
 
 def test_a_trial_reads_back_as_written(tmp_path):
+    write_json(tmp_path / "study.json", STUDY)
     trial = RunFolder(tmp_path).trial("random_0000")
     trial.start(CONFIG)
     trial.append(ENTRY)
@@ -75,3 +77,40 @@ def test_damaged_json_is_named(tmp_path):
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(DataError, match=r"summary\.json: not JSON"):
         RunFolder(tmp_path).read("summary.json")
+
+
+def test_a_run_folder_of_another_format_is_refused(tmp_path):
+    write_json(tmp_path / "study.json", STUDY | {"format": FORMAT + 1})
+    with pytest.raises(DataError, match=f"format {FORMAT + 1}, and this version of cconv reads format {FORMAT}"):
+        RunFolder.open(tmp_path)
+    write_json(tmp_path / "study.json", {"name": "of the first version"})
+    with pytest.raises(DataError, match="format 1"):
+        RunFolder.open(tmp_path)
+
+
+def test_a_corrupt_line_is_named_with_its_number(tmp_path):
+    trial = RunFolder(tmp_path).trial("random_0000")
+    trial.start(CONFIG)
+    trial.append(ENTRY)
+    with (trial.path / "log.jsonl").open("a") as file:
+        file.write('{"updates": 10}\n')
+    trial.append(ENTRY)
+    with pytest.raises(DataError, match=r"log\.jsonl: line 2 .*delete that line"):
+        trial.read()
+
+
+def test_a_folder_is_held_by_one_run_at_a_time(tmp_path):
+    with RunFolder(tmp_path).locked():
+        with pytest.raises(ConfigError, match="another run works in this folder"), RunFolder(tmp_path).locked():
+            pass
+    with RunFolder(tmp_path).locked():
+        pass
+
+
+def test_what_was_logged_after_the_progress_is_dropped(tmp_path):
+    trial = RunFolder(tmp_path).trial("random_0000")
+    trial.start(CONFIG)
+    for updates in (5, 10, 15):
+        trial.append(ENTRY | {"updates": updates})
+    trial.go_on(10)
+    assert [entry["updates"] for entry in trial.log()] == [5, 10]

@@ -1,10 +1,20 @@
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 from cconv.errors import ConfigError
+from cconv.study.closed_form import single_layers
 from cconv.study.config import TrainingConfig
-from cconv.study.space import configure, load_space, optuna_distributions, ray_domains
+from cconv.study.space import (
+    Choice,
+    SearchSpace,
+    check_baseline_affordable,
+    configure,
+    fixed,
+    load_space,
+    narrowed,
+)
 from cconv.training.field_model import NetworkConfig
 
 SPACES = sorted((Path(__file__).parents[2] / "search_spaces").glob("*.toml"))
@@ -15,6 +25,13 @@ FLOAT = (
     '[parameters.learning_rate]\ntype = "float"\nrange = [1e-4, 1e-2]\nscale = "log"\nbaseline = 1e-3\nreason = "r"\n'
 )
 INT = '[parameters.kernel_size]\ntype = "int"\nrange = [3, 6]\nbaseline = 4\nreason = "r"\n'
+
+
+BASIS = '[parameters.basis]\ntype = "choice"\nvalues = ["grid", "radial"]\nbaseline = "grid"\nreason = "r"\n'
+SKIP = (
+    '[parameters.skip]\ntype = "choice"\nvalues = ["after_activation"]\nbaseline = "after_activation"\nreason = "r"\n'
+)
+OF_GRID = 'when = { basis = ["grid"] }\n'
 
 
 @pytest.fixture
@@ -34,28 +51,111 @@ def test_every_space_of_the_repository_loads_and_explains_itself(path):
     configure(space.baseline, NetworkConfig(), TrainingConfig())
 
 
-def test_the_density_spaces_baseline_is_the_default_network_and_training():
-    space = load_space(next(path for path in SPACES if path.stem == "density"))
+@pytest.mark.parametrize("name", ["density", "thesis_initial", "thesis_random", "thesis_bayesian"])
+def test_the_baseline_is_the_published_network_and_training(name):
+    space = load_space(next(path for path in SPACES if path.stem == name))
     network, training = configure(space.baseline, NetworkConfig(), TrainingConfig())
     assert network == NetworkConfig()
     assert training == TrainingConfig()
 
 
-def test_ray_and_optuna_draw_within_the_space(space_file):
-    space = load_space(space_file(CHOICE + FLOAT + INT))
-    distributions = optuna_distributions(space)
-    for _ in range(200):
-        drawn = {name: domain.sample() for name, domain in ray_domains(space).items()}
-        assert drawn["window"] in ("none", "poly6")
-        assert 1e-4 <= drawn["learning_rate"] <= 1e-2
-        assert drawn["kernel_size"] in (3, 4, 5, 6)
-        for name, distribution in distributions.items():
-            assert distribution._contains(distribution.to_internal_repr(drawn[name]))
+def conditional_space():
+    """Kernel size on the grid only; mapping only for the larger two; terms on the radial basis only."""
+    parameters = {
+        "mapping": {"values": ["identity", "ball_to_cube_radial"], "when": {"kernel_size": [4, 5]}},
+        "kernel_size": {"type": "int", "range": [3, 5], "baseline": 4, "when": {"basis": ["grid"]}},
+        "basis": {"values": ["grid", "radial"]},
+        "radial_terms": {"values": [8, 16], "when": {"basis": ["radial"]}},
+        "window": {"values": ["none", "poly6"], "when": {"basis": ["grid"], "layers": [2]}},
+        "layers": {"values": [1, 2]},
+    }
+    for parameter in parameters.values():
+        parameter.setdefault("type", "choice")
+        parameter.setdefault("baseline", parameter.get("values", [None])[0])
+        parameter["reason"] = "r"
+    return SearchSpace.model_validate({"name": "c", "description": "d", "parameters": parameters})
 
 
-def test_both_ends_of_a_whole_number_range_are_drawn(space_file):
-    domain = ray_domains(load_space(space_file(INT)))["kernel_size"]
-    assert {domain.sample() for _ in range(200)} == {3, 4, 5, 6}
+ALL = {"mapping": "identity", "kernel_size": 4, "basis": "grid", "radial_terms": 8, "window": "none", "layers": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "active"),
+    [
+        ({}, {"mapping", "kernel_size", "basis", "window", "layers"}),
+        ({"kernel_size": 3}, {"kernel_size", "basis", "window", "layers"}),
+        ({"layers": 1}, {"mapping", "kernel_size", "basis", "layers"}),
+        ({"basis": "radial"}, {"basis", "radial_terms", "layers"}),
+    ],
+)
+def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
+    space, values = conditional_space(), ALL | changes
+    assert space.active(values) == {name: values[name] for name in values if name in active}
+    assert space.active(space.active(values)) == space.active(values)
+
+
+def test_parents_come_before_those_that_depend_on_them():
+    order = conditional_space().parents_first
+    assert sorted(order) == sorted(ALL)
+    assert order.index("basis") < order.index("kernel_size") < order.index("mapping")
+
+
+def test_the_baseline_holds_active_parameters_only():
+    assert conditional_space().baseline == {"mapping": "identity", "kernel_size": 4, "basis": "grid", "layers": 1}
+
+
+def test_a_configuration_is_whole_and_in_its_domain():
+    space = conditional_space()
+    whole = space.active(ALL)
+    assert space.holds(whole)
+    assert space.holds({"basis": "radial", "radial_terms": 8, "layers": 1})
+    missing = {name: value for name, value in whole.items() if name != "mapping"}
+    for wrong in (ALL, missing, whole | {"kernel_size": 7}, whole | {"learning_rate": 1e-3}):
+        assert not space.holds(wrong)
+
+
+def test_conditions_follow_a_narrower_domain():
+    space = conditional_space()
+    small = narrowed(space, {"kernel_size": space.parameters["kernel_size"].model_copy(update={"range": (3, 4)})})
+    assert small.parameters["mapping"].when == {"kernel_size": [4]}
+    grid = Choice(type="choice", values=["grid"], baseline="grid", reason="r")
+    assert narrowed(space, {"basis": grid}).parameters.keys() == ALL.keys() - {"radial_terms"}
+
+
+def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
+    space = fixed(conditional_space(), "layers")
+    assert space.parameters["layers"].values == [1]
+    assert "window" not in space.parameters
+    assert space.baseline == conditional_space().baseline
+    assert fixed(space, "boundary") == space
+
+
+def test_single_layers_hold_what_is_active_in_one():
+    layers = single_layers(conditional_space(), NetworkConfig(), 3)
+    grid = [layer for layer in layers if layer["basis"] == "grid"]
+    assert [layer for layer in grid if layer["kernel_size"] == 3] == [{"layers": 1, "basis": "grid", "kernel_size": 3}]
+    assert all(
+        set(layer) == {"layers", "basis", "kernel_size", "mapping"} for layer in grid if layer["kernel_size"] > 3
+    )
+    assert len(grid) == 1 + 2 * 2  # no window: it takes two layers
+    radial = [layer for layer in layers if layer["basis"] == "radial"]
+    assert radial == [{"layers": 1, "basis": "radial", "radial_terms": terms} for terms in (8, 16)]
+
+
+def test_single_layers_of_the_density_space_are_distinct_configurations_with_all_switches():
+    space = load_space(next(path for path in SPACES if path.stem == "density"))
+    layers = single_layers(space, NetworkConfig(), 2)
+    assert len({repr(sorted(layer.items())) for layer in layers}) == len(layers)
+    assert all(space.holds(layer | {"learning_rate": 1e-3}) for layer in layers)
+    assert {(layer["boundary"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
+
+
+def test_a_baseline_above_the_cap_is_refused():
+    space = conditional_space().model_copy(update={"max_flops_per_particle": 2e6})
+    check_baseline_affordable(space, lambda parameters: 1e6 if parameters == space.baseline else 3e6)
+    check_baseline_affordable(conditional_space(), lambda parameters: 1e9)
+    with pytest.raises(ConfigError, match=r"'c': its baseline costs 3e\+06 FLOPs .* `max_flops_per_particle` = 2e"):
+        check_baseline_affordable(space, lambda parameters: 3e6)
 
 
 @pytest.mark.parametrize(
@@ -71,6 +171,21 @@ def test_both_ends_of_a_whole_number_range_are_drawn(space_file):
         (INT.replace("[3, 6]", "[0, 6]"), "the value 0 is not possible"),
         (INT.replace('"int"', '"integer"'), "parameters.kernel_size"),
         ("", "`parameters` is missing"),
+        ("max_flops_per_particle = 0.0\n" + CHOICE, "`max_flops_per_particle`: input should be greater than 0"),
+        (INT + OF_GRID, r"`parameters\.kernel_size\.when\.basis`: names no parameter of the space"),
+        (INT + 'when = { bases = ["grid"] }\n' + BASIS, r"Did you mean 'basis'"),
+        (
+            INT + 'when = { basis = ["gird"] }\n' + BASIS,
+            r"basis`: lists 'gird', which is not in the domain of 'basis'",
+        ),
+        (
+            INT + "when = { basis = [] }\n" + BASIS,
+            r"`parameters\.kernel_size\.when\.basis`: list should have",
+        ),
+        (CHOICE + "when = { kernel_size = [7] }\n" + INT, r"when\.kernel_size`: lists 7, which is not in the domain"),
+        (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
+        (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
+        (BASIS.replace('= "grid"', '= "radial"') + SKIP, r"the baseline is not possible .*skip 'after_activation'"),
     ],
 )
 def test_what_does_not_fit_is_named(text, message, space_file):

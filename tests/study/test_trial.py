@@ -55,3 +55,31 @@ def test_interrupt_before_the_first_evaluation_leaves_a_usable_checkpoint(genera
     with pytest.raises(KeyboardInterrupt):
         list(trial(given, folder, on_update=interrupt))
     assert load_model(folder.checkpoint).predict(given.valid_samples[0].inputs).isfinite().all()
+
+
+def test_a_trial_that_was_left_goes_on_to_the_same_log_and_checkpoint(generator, tmp_path):
+    """The kill comes after the log's last line, before the progress that belongs to it."""
+    given, run = problem(generator), RunFolder(tmp_path)
+    whole, cut = run.trial("random_0000"), run.trial("random_0001")
+    list(trial(given, whole))
+    entries = trial(given, cut)
+    next(entries)
+    progress = cut.progress.read_bytes()
+    next(entries)
+    cut.progress.write_bytes(progress)
+    rest = list(trial(given, cut))
+    assert [entry["updates"] for entry in rest] == [4, 6]
+    errors = [[entry["valid_normalized_mse"] for entry in folder.log()] for folder in (whole, cut)]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-6)
+    assert read_card(cut.checkpoint)["updates"] == read_card(whole.checkpoint)["updates"]
+
+
+def test_a_trial_ends_at_its_limit_of_time(generator, tmp_path):
+    folder = RunFolder(tmp_path).trial("random_0000")
+    assert list(trial(problem(generator), folder, seconds_limit=0.0)) == []
+
+
+def test_a_trial_says_what_it_costs_before_it_is_trained(generator, tmp_path):
+    folder = RunFolder(tmp_path).trial("random_0000")
+    next(trial(problem(generator), folder))
+    assert folder.read().config["flops_per_particle"] > 0

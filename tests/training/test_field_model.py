@@ -1,12 +1,16 @@
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 from systems import kernel, periodic_frame, periodic_scene, problem, samples, with_walls
 
+from cconv.data.features import inputs_without_density
 from cconv.data.targets import make_sample
 from cconv.data.trajectory import Boundary
 from cconv.errors import ShapeError
+from cconv.training.checkpoint import load_model, save_model
+from cconv.training.closed_form import solve_closed_form
 from cconv.training.field_model import NetworkConfig, build_field_model
 
 SMALL = NetworkConfig(layers=2, first_channels=4, kernel_size=3)
@@ -83,3 +87,106 @@ def test_a_radial_model_turns_with_the_scene(task, message, generator):
 def test_settings_of_the_other_basis_are_refused():
     with pytest.raises(ValueError, match="skip 'after_activation' is for basis 'grid'"):
         NetworkConfig(basis="radial", skip="after_activation")
+
+
+BASES = [SMALL, NetworkConfig(layers=2, basis="radial", first_channels=4, radial_terms=5)]
+
+
+def walled_model(network, frame, generator, task="density_rate"):
+    """A model of the periodic scene with walls, fitted to one frame."""
+    scene = periodic_scene()
+    train = [make_sample(frame, scene, task, kernel(scene))]
+    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator)
+    if network.layers == 1:
+        solve_closed_form(model, train)
+    return model
+
+
+def with_moved_walls(frame):
+    """The frame with its wall points 0.3 spacings higher."""
+    up = torch.tensor([0.0, 0.3 / 8])
+    return replace(frame, boundary=replace(frame.boundary, positions=frame.boundary.positions + up))
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+def test_only_a_model_with_a_boundary_branch_sees_the_walls(network, layers, generator):
+    scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
+    moved = with_moved_walls(frame)
+    for boundary in (True, False):
+        settings = network.model_copy(update={"boundary": boundary, "layers": layers})
+        model = walled_model(settings, frame, generator)
+        sees = not torch.equal(model.predict_frame(frame, scene.box), model.predict_frame(moved, scene.box))
+        assert sees == boundary
+
+
+def test_a_model_without_boundary_branch_takes_scenes_with_and_without_walls(generator):
+    scene, frame = periodic_scene(), periodic_frame(generator)
+    model = walled_model(SMALL.model_copy(update={"boundary": False}), with_walls(frame), generator)
+    assert model.config.boundary_channels == 0
+    walled, bare = (model.predict_frame(each, scene.box) for each in (with_walls(frame), frame))
+    assert torch.equal(walled, bare)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+def test_only_a_model_with_the_density_feature_sees_the_masses(network, layers, generator):
+    scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
+    heavier = replace(frame, masses=1.1 * frame.masses)
+    for density in (True, False):
+        settings = network.model_copy(update={"density": density, "layers": layers})
+        model = walled_model(settings, frame, generator)
+        sees = not torch.equal(model.predict_frame(frame, scene.box), model.predict_frame(heavier, scene.box))
+        assert sees == density
+
+
+@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+def test_a_model_without_density_takes_inputs_with_and_without_it(network, generator):
+    scene, frame = periodic_scene(), periodic_frame(generator)
+    sample = make_sample(frame, scene, "density_rate", kernel(scene))
+    bare = inputs_without_density(frame, scene.box)
+    model = walled_model(network.model_copy(update={"density": False}), frame, generator)
+    assert torch.equal(model.predict(sample.inputs), model.predict(bare))
+    with pytest.raises(ShapeError, match="expects 4 features .* have 3"):
+        walled_model(network, frame, generator).predict(bare)
+
+
+def test_what_is_switched_off_has_no_parameters(generator):
+    """Grid: each branch of the first layer and what the second reads of it; radial: coefficients of the inputs."""
+    frame = with_walls(periodic_frame(generator))
+
+    def count(network, **switches):
+        return walled_model(network.model_copy(update=switches), frame, generator).num_parameters
+
+    grid, radial = BASES
+    cells, first = grid.kernel_size**2, grid.first_channels
+    branch = cells * 2 * first + first  # two components of the normal, and a bias
+    assert count(grid) - count(grid, boundary=False) == branch + (cells + 1) * first
+    assert count(grid) - count(grid, density=False) == (cells + 1) * first
+    scalars, vectors = 2 * radial.first_channels, radial.first_channels  # a gate for each vector
+    of_a_normal = radial.radial_terms * (scalars + 2 * vectors)  # n·r̂; n and (n·r̂) r̂
+    assert count(radial) - count(radial, boundary=False) == of_a_normal
+    of_the_density = radial.radial_terms * (scalars + vectors) + scalars
+    assert count(radial) - count(radial, density=False) == of_the_density
+
+
+@pytest.mark.parametrize("basis", ["grid", "radial"])
+@pytest.mark.parametrize("switches", [{"boundary": False}, {"density": False}, {"boundary": False, "density": False}])
+def test_a_switched_model_is_solved_saved_and_loaded(basis, switches, generator, tmp_path):
+    scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
+    network = NetworkConfig(layers=1, basis=basis, kernel_size=3, radial_terms=8, message="difference", **switches)
+    model = walled_model(network, frame, generator)
+    save_model(model, tmp_path / "model", {})
+    again = load_model(tmp_path / "model")
+    assert torch.equal(again.predict_frame(frame, scene.box), model.predict_frame(frame, scene.box))
+
+
+def test_a_model_stored_before_there_were_switches_has_both(generator, tmp_path):
+    frame = with_walls(periodic_frame(generator))
+    model = walled_model(SMALL, frame, generator)
+    save_model(model, tmp_path / "model", {})
+    path = tmp_path / "model" / "config.json"
+    stored = json.loads(path.read_text())
+    del stored["network"]["boundary"], stored["network"]["density"]
+    path.write_text(json.dumps(stored))
+    assert load_model(tmp_path / "model").config == model.config

@@ -1,0 +1,276 @@
+r"""What a model has learned: its field beside the analytic one, the spread of its errors, its filters beside ∇W.
+
+The filters of the first layer are probed, not read: pairs of particles lie far apart from all others, one feature of
+the sending particle is raised by one unit, and the answer at the receiving particle is the filter at
+:math:`d = x_j - x_i`. The same pairs probe the analytic operators, whose filters are :math:`m \nabla W(d)` for the
+density rate (D2) and :math:`-m \nabla W(d) / \rho_i` for the density gradient (D3). So interpolation, windows, maps and
+radial terms count exactly as they do in a prediction.
+"""
+
+import math
+from collections.abc import Iterable
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cconv.data.features import FluidState, Inputs
+from cconv.data.targets import TASKS, VECTOR_TASKS, Sample
+from cconv.domain import Box
+from cconv.neighbors import radius_graph
+from cconv.nn.filters import window_values
+from cconv.sph.operators import density
+from cconv.training.field_model import FieldModel
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
+_POINTS_ON_LINE, _RADII, _BINS_PER_DECADE = 161, 80, 5
+
+
+@torch.no_grad()
+def explain(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
+    """Fields and first-layer filters of a model on one frame; arrays that `np.savez` holds and `np.load` reads.
+
+    Args:
+        model: The model.
+        sample: A frame that the model was not trained on. Filters are scaled by its mass and mean density.
+
+    Returns:
+        "task"; "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
+        "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns.
+    """
+    prediction = model.predict(sample.inputs)
+    return {
+        "task": np.array(model.config.task),
+        "particle_spacing": np.array(model.config.particle_spacing),
+        "positions": sample.inputs.positions.numpy(),
+        "target": sample.target.numpy(),
+        "prediction": prediction.numpy(),
+        "error": _relative_errors(model, sample, prediction).square().numpy(),
+        **first_layer_filters(model, sample),
+    }
+
+
+@torch.no_grad()
+def error_distribution(model: FieldModel, samples: Iterable[Sample]) -> dict[str, np.ndarray]:
+    """How the errors of single particles are spread.
+
+    An error is the root mean square over the components of prediction - target, by the standard deviation of the target
+    over training.
+
+    Returns:
+        "error_bins" (B + 1,), logarithmic; "error_counts" (B,), particles in each, the first and last bin hold all that
+        lie beyond; "error_levels" and "error_quantiles", the quantiles of these levels.
+    """
+    errors = torch.cat([_relative_errors(model, sample, model.predict(sample.inputs)) for sample in samples]).numpy()
+    bins = np.logspace(-8, 3, 11 * _BINS_PER_DECADE + 1)
+    finite = np.nan_to_num(errors, nan=np.inf, posinf=np.inf)
+    counts, _ = np.histogram(finite.clip(bins[0], bins[-1]), bins)
+    return {
+        "error_bins": bins,
+        "error_counts": counts,
+        "error_levels": np.array(QUANTILES),
+        "error_quantiles": np.quantile(finite, QUANTILES, method="lower"),
+    }
+
+
+@torch.no_grad()
+def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
+    """Learned filters of the fluid's first layer beside the analytic ones.
+
+    A network of one layer is compared as it is. The outputs of a deeper one have no meaning of their own: its filters
+    are combined linearly so that they come as near to the analytic ones as they can, by least squares over the ball.
+
+    Returns:
+        "feature_names" (F,); "is_combined", whether the network has several layers; "unexplained", the squared
+        difference by the squared analytic filter over the ball, in the features that the analytic operator reads;
+        "cutoff" and "support", the radii of the filters and of W; "line" (L,), offsets through the centre;
+        "learned_on_axes" and "analytic_on_axes" (D, L, F, C), filters of each feature and component along each axis;
+        "radii" (K,), "learned_radial" (K,), "learned_radial_low" and "learned_radial_high" (K,), the part along d/r
+        averaged over directions and what nine of ten directions keep; "analytic_radial" (K,).
+    """
+    pairs = _probing_pairs(model)
+    analytic = _analytic_filters(model, sample, pairs)
+    learned = _learned_filters(model, sample, pairs)
+    learned = learned @ _combination(learned[pairs.ball], analytic[pairs.ball], pairs.volume, model)
+    profile = _along_direction(learned, pairs, model.config.task)
+    results = {
+        "is_combined": torch.tensor(len(model.network.convs) > 1),
+        "unexplained": _unexplained(learned[pairs.ball], analytic[pairs.ball], pairs.volume),
+        "cutoff": torch.tensor(model.cutoff),
+        "support": torch.tensor(model.kernel.support_radius),
+        "line": pairs.line,
+        "learned_on_axes": _on_axes(learned, pairs),
+        "analytic_on_axes": _on_axes(analytic, pairs),
+        "radii": pairs.radii,
+        "learned_radial": profile.mean(dim=1),
+        "learned_radial_low": profile.quantile(0.05, dim=1),
+        "learned_radial_high": profile.quantile(0.95, dim=1),
+        "analytic_radial": _along_direction(analytic, pairs, model.config.task)[:, 0],
+    }
+    names = ["1", *(f"v_{axis}" for axis in "xyz"[: model.config.dim]), "ρ"]
+    return {"feature_names": np.array(names)} | {name: values.numpy() for name, values in results.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pairs:
+    """Displacements d = x_j - x_i at which filters are probed: first along each axis, then over a ball.
+
+    Attributes:
+        displacements: (P, D).
+        ball: Which of them belong to the ball, (P,).
+        line: Offsets along an axis, (L,).
+        radii: Distances in the ball, (K,); each has the same directions.
+        volume: Weight of each point of the ball, as the volume that it stands for.
+        spacing: Distance between two pairs, beyond which neither filters nor W reach.
+    """
+
+    displacements: Tensor
+    ball: Tensor
+    line: Tensor
+    radii: Tensor
+    volume: Tensor
+    spacing: float
+
+    @property
+    def positions(self) -> Tensor:
+        """Receivers (P, D), then senders (P, D), each pair apart from all others."""
+        receivers = torch.zeros_like(self.displacements)
+        receivers[:, 0] = self.spacing * torch.arange(len(receivers))
+        return torch.cat([receivers, receivers + self.displacements])
+
+
+def _probing_pairs(model: FieldModel) -> _Pairs:
+    dim, reach = model.config.dim, max(model.cutoff, model.kernel.support_radius)
+    line = torch.linspace(-reach, reach, _POINTS_ON_LINE, dtype=torch.float64)
+    on_axes = torch.cat([line[:, None] * axis for axis in torch.eye(dim, dtype=torch.float64)])
+    radii = reach * (torch.arange(_RADII, dtype=torch.float64) + 0.5) / _RADII
+    directions = _directions(dim)
+    in_ball = (radii[:, None, None] * directions).flatten(0, 1)
+    return _Pairs(
+        displacements=torch.cat([on_axes, in_ball]),
+        ball=torch.arange(len(on_axes) + len(in_ball)) >= len(on_axes),
+        line=line,
+        radii=radii,
+        volume=(radii ** (dim - 1)).repeat_interleave(len(directions)),
+        spacing=4 * reach,
+    )
+
+
+def _directions(dim: int) -> Tensor:
+    """Evenly spread unit vectors (M, D): both of a line, 48 of a circle, 96 of a sphere (a golden spiral)."""
+    if dim == 1:
+        return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    if dim == 2:
+        angles = 2 * math.pi * (torch.arange(48, dtype=torch.float64) + 0.5) / 48
+        return torch.stack([angles.cos(), angles.sin()], dim=1)
+    turns = torch.arange(96, dtype=torch.float64)
+    height, angles = 1 - (2 * turns + 1) / 96, math.pi * (3 - math.sqrt(5)) * turns
+    width = (1 - height.square()).sqrt()
+    return torch.stack([width * angles.cos(), width * angles.sin(), height], dim=1)
+
+
+def _learned_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor:
+    """Answers of the first convolution (P, F, C_out), by unit of each feature, without bias."""
+    twin = deepcopy(model).double()
+    network = model.config.network.model_copy(update={"normalize": False})
+    twin.config = model.config.model_copy(update={"network": network})
+    rest = sample.inputs.features.double().mean(dim=0).expand(2 * len(pairs.displacements), -1)
+    inputs = _isolated_inputs(pairs, rest, model.config.boundary_channels)
+    geometry = twin.geometry(inputs)
+
+    def answer(features: Tensor) -> Tensor:
+        values = twin.network_inputs(_isolated_inputs(pairs, features, model.config.boundary_channels), geometry)[0]
+        return twin.network.convs[0](values, geometry.fluid)[: len(pairs.displacements)]
+
+    answers = [answer(raised) - answer(rest) for raised in _raised(rest)]
+    return torch.stack(answers, dim=1) / (_mean_window_sum(model, sample) if model.config.network.normalize else 1)
+
+
+def _analytic_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor:
+    """Answers of the analytic operator (P, F, C), by unit of each feature, for the frame's mass and mean density."""
+    inputs, kernel = sample.inputs.double(), model.kernel
+    densities = inputs.features[:, -1]
+    edges = radius_graph(inputs.positions, kernel.support_radius, inputs.box)
+    mass = (densities / density(torch.ones_like(densities), edges, kernel)).mean()
+    rest = torch.zeros(2 * len(pairs.displacements), inputs.features.shape[1], dtype=torch.float64)
+    rest[:, -1] = densities.mean()
+    edges = radius_graph(pairs.positions, kernel.support_radius)
+
+    def answer(features: Tensor) -> Tensor:
+        state = FluidState(
+            positions=pairs.positions,
+            velocities=features[:, 1:-1],
+            masses=mass.expand(len(features)),
+            densities=features[:, -1],
+            edges=edges,
+        )
+        field = TASKS[model.config.task](state, kernel)
+        return field[: len(pairs.displacements)]
+
+    return torch.stack([answer(raised) for raised in _raised(rest)], dim=1)
+
+
+def _raised(rest: Tensor) -> list[Tensor]:
+    """Features (2P, F) with one feature of the senders raised by one, for each feature."""
+    senders = torch.arange(len(rest)) >= len(rest) // 2
+    units = torch.eye(rest.shape[1], dtype=rest.dtype)
+    return [rest + senders[:, None] * unit for unit in units]
+
+
+def _isolated_inputs(pairs: _Pairs, features: Tensor, boundary_channels: int) -> Inputs:
+    positions = pairs.positions
+    dim = positions.shape[1]
+    return Inputs(
+        positions=positions,
+        features=features,
+        boundary_positions=positions.new_zeros(0, dim) if boundary_channels else None,
+        boundary_features=positions.new_zeros(0, boundary_channels) if boundary_channels else None,
+        box=Box([0.0] * dim, [1.0] * dim),
+    )
+
+
+def _mean_window_sum(model: FieldModel, sample: Sample) -> Tensor:
+    """Mean over particles of ψ, by which normalised filters are divided."""
+    edges = radius_graph(sample.inputs.positions.double(), model.cutoff, sample.inputs.box)
+    values = window_values((edges.distances / edges.cutoff) ** 2, model.config.network.window)
+    return values.sum() / edges.num_receivers
+
+
+def _combination(learned: Tensor, analytic: Tensor, volume: Tensor, model: FieldModel) -> Tensor:
+    """Weights (C_out, C) of the layer's outputs: the target's units, or the nearest to the analytic filters."""
+    if len(model.network.convs) == 1:
+        return torch.diag(model.target_scale.double())
+    read, root = _read_features(analytic), volume.sqrt()[:, None, None]
+    terms, wanted = ((root * values[:, read]).flatten(0, 1) for values in (learned, analytic))
+    return torch.linalg.lstsq(terms, wanted, driver="gelsd").solution
+
+
+def _unexplained(learned: Tensor, analytic: Tensor, volume: Tensor) -> Tensor:
+    read, weights = _read_features(analytic), volume[:, None, None]
+    difference, size = ((weights * values[:, read].square()).sum() for values in (learned - analytic, analytic))
+    return difference / size
+
+
+def _read_features(analytic: Tensor) -> Tensor:
+    """Which features the analytic operator reads, (F,)."""
+    return analytic.abs().amax(dim=(0, 2)) > 0
+
+
+def _on_axes(filters: Tensor, pairs: _Pairs) -> Tensor:
+    """Filters along each axis, (D, L, F, C)."""
+    return filters[~pairs.ball].unflatten(0, (-1, len(pairs.line)))
+
+
+def _along_direction(filters: Tensor, pairs: _Pairs, task: str) -> Tensor:
+    """The part of filters (P, F, C) along d/r that turns velocities (D2) or the density (D3), by distance (K, M)."""
+    displacements = pairs.displacements[pairs.ball]
+    directions = displacements / displacements.norm(dim=1, keepdim=True)
+    vectors = filters[pairs.ball, -1, :] if task in VECTOR_TASKS else filters[pairs.ball, 1:-1, 0]
+    return (vectors * directions).sum(dim=1).unflatten(0, (len(pairs.radii), -1))
+
+
+def _relative_errors(model: FieldModel, sample: Sample, prediction: Tensor) -> Tensor:
+    """Root mean square of each particle's error over the components, by the standard deviation of the target, (N,)."""
+    return ((prediction - sample.target) / model.target_scale).double().square().mean(dim=1).sqrt()

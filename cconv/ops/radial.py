@@ -1,0 +1,208 @@
+"""Radial convolution in compiled loops over a few hundred edges at a time: nothing of the size of all edges is made.
+
+For the CPU, float32 and float64; not differentiable. Each edge reads the filters of all outputs, at a cost that grows
+with their number: for few of them. Compiled as in `gathers`, but that sums may also change their order.
+"""
+
+import numpy as np
+import torch
+from numba import int32, njit, uintp
+from torch import Tensor
+
+from cconv.neighbors import Edges
+from cconv.ops.workers import run_on_workers
+
+_compile = njit(nogil=True, cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
+
+EDGES_AT_A_TIME = 512  # worked on at a time: their values fit the innermost cache
+MOST_OUTPUTS = 20  # of a kind: more take longer than gathering messages and multiplying them with the filters
+_READS_PER_WORKER = 2**19  # fewer cost less than waking a thread
+
+
+def applies(features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, edges: Edges) -> bool:
+    """Whether `convolve` does, and is faster than the general path: nothing to differentiate, few outputs, the CPU."""
+    tensors = (features, scalar_filters, vector_filters, edges.displacements)
+    differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return (
+        not differentiated
+        and max(scalar_filters.shape[2], vector_filters.shape[2]) <= MOST_OUTPUTS
+        and features.device.type == "cpu"
+        and features.dtype in (torch.float32, torch.float64)
+        and not torch.compiler.is_compiling()
+    )
+
+
+def convolve(
+    features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, edges: Edges, weights: Tensor | None, own: float
+) -> Tensor:
+    """Radial convolution without bias; equations in `cconv.nn.radial_conv`.
+
+    Args:
+        features: Scalars, then components of vectors (M, S + V · D).
+        scalar_filters: Values at evenly spaced distances from 0 to the cutoff (B, S + V, S_out).
+        vector_filters: (B, S + 2V, V_out).
+        edges: Pairs of receivers and senders.
+        weights: Weight of each edge (E,), None for 1.
+        own: Message of an edge = sender's features + ``own`` times the receiver's.
+
+    Returns:
+        Scalars, then components of vectors, (N, S_out + V_out · D).
+    """
+    values = features.detach().contiguous().numpy()
+    filters = [_by_output(each) for each in (scalar_filters, vector_filters)]
+    output = np.zeros((edges.num_receivers, len(filters[0]) + len(filters[1]) * edges.dim), values.dtype)
+    tensors = (edges.row_splits, edges.receivers, edges.senders, edges.displacements, edges.distances)
+    arrays = [tensor.detach().numpy() for tensor in tensors]
+    weighted = None if weights is None else weights.detach().numpy()
+    number = values.dtype.type
+    arguments = (*arrays, weighted, number(edges.cutoff), values, number(own), *filters, output)
+    workers = _num_workers(len(edges) * sum(each[..., 0].size for each in filters))
+    bounds = [edges.num_receivers * worker // workers for worker in range(workers + 1)]
+    run_on_workers(lambda worker: _convolve_rows(bounds[worker], bounds[worker + 1], *arguments), workers)
+    return torch.from_numpy(output)
+
+
+def _by_output(filters: Tensor) -> np.ndarray:
+    """Filters (B, C_in, C_out) as (C_out, C_in, B + 1), the last value twice: there is one above the last, too."""
+    values = filters.detach().numpy()
+    return np.ascontiguousarray(np.concatenate([values, values[-1:]]).transpose(2, 1, 0))
+
+
+def _num_workers(reads: int) -> int:
+    return max(1, min(torch.get_num_threads(), reads // _READS_PER_WORKER))
+
+
+@_compile
+def _convolve_rows(
+    first, last, splits, receivers, senders, displacements, distances, weights, cutoff, features, own,
+    scalar_filters, vector_filters, output,
+):  # fmt: skip
+    """Add the convolution at the receivers from `first` up to `last` to their rows of `output`."""
+    dim, vectors = displacements.shape[1], vector_filters.shape[1] - scalar_filters.shape[1]
+    scalars = scalar_filters.shape[1] - vectors
+    lower, shares = np.empty(EDGES_AT_A_TIME, np.int32), np.empty((2, EDGES_AT_A_TIME), features.dtype)
+    directions = np.empty((dim, EDGES_AT_A_TIME), features.dtype)
+    messages = np.empty((scalars + vectors + vectors * dim, EDGES_AT_A_TIME), features.dtype)
+    terms = np.empty((output.shape[1], EDGES_AT_A_TIME), features.dtype)
+    row = first
+    for start in range(splits[first], splits[last], EDGES_AT_A_TIME):
+        end = min(start + EDGES_AT_A_TIME, splits[last])
+        count = uintp(end - start)
+        _place(distances[start:end], cutoff, scalar_filters.shape[2] - 1, lower, shares)
+        if weights is not None:
+            _scale(weights[start:end], shares)
+        _point(displacements[start:end], distances[start:end], directions)
+        _gather(receivers[start:end], senders[start:end], features, own, scalars, vectors, messages)
+        _project(directions, count, scalars, vectors, messages)
+        _set_scalars(messages, scalar_filters, lower, shares, count, terms)
+        _set_vectors(messages, directions, vector_filters, lower, shares, count, scalars, terms[len(scalar_filters) :])
+        row = _add_to_rows(terms, start, end, row, splits, output)
+
+
+@_compile
+def _place(distances, cutoff, num_terms, lower, shares):
+    """Set the filter value at or below each distance, and the shares of it and of the next."""
+    one, steps = distances.dtype.type(1), distances.dtype.type(num_terms - 1)
+    largest = int32(max(num_terms - 2, 0))
+    for k in range(uintp(len(distances))):
+        place = distances[k] / cutoff * steps
+        lower[k] = min(int32(place), largest)
+        shares[1, k] = min(place - distances.dtype.type(lower[k]), one)
+        shares[0, k] = one - shares[1, k]
+
+
+@_compile
+def _scale(weights, shares):
+    for k in range(uintp(len(weights))):
+        shares[0, k] *= weights[k]
+        shares[1, k] *= weights[k]
+
+
+@_compile
+def _point(displacements, distances, directions):
+    """Set the directions (D, E) from receivers to senders, 0 where two points coincide."""
+    one = distances.dtype.type(1)
+    for k in range(uintp(len(distances))):
+        inverse = -one / (distances[k] if distances[k] > 0 else one)
+        for axis in range(uintp(len(directions))):
+            directions[axis, k] = displacements[k, axis] * inverse
+
+
+@_compile
+def _gather(receivers, senders, features, own, scalars, vectors, messages):
+    """Set the messages (S + V + V · D, E): scalars, room for projections, components of vectors."""
+    for c in range(features.shape[1]):
+        row = messages[c if c < scalars else c + vectors]
+        if own:
+            for k in range(uintp(len(senders))):
+                row[k] = features[uintp(senders[k]), c] + own * features[uintp(receivers[k]), c]
+        else:
+            for k in range(uintp(len(senders))):
+                row[k] = features[uintp(senders[k]), c]
+
+
+@_compile
+def _project(directions, count, scalars, vectors, messages):
+    """Set the projections of the vectors among the messages on the directions."""
+    dim = len(directions)
+    for v in range(vectors):
+        projections = messages[scalars + v]
+        projections[:] = 0
+        for axis in range(dim):
+            component, direction = messages[scalars + vectors + v * dim + axis], directions[axis]
+            for k in range(count):
+                projections[k] += component[k] * direction[k]
+
+
+@_compile
+def _add_read(values, lower, shares, message, count, sums):
+    """Add what each edge reads of a filter times its message."""
+    for k in range(count):
+        place = uintp(lower[k])
+        sums[k] += (shares[0, k] * values[place] + shares[1, k] * values[place + uintp(1)]) * message[k]
+
+
+@_compile
+def _set_scalars(messages, filters, lower, shares, count, terms):
+    """Set what each edge adds to the scalars, (S_out, E)."""
+    for output in range(len(filters)):
+        terms[output] = 0
+        for c in range(filters.shape[1]):
+            _add_read(filters[output, c], lower, shares, messages[c], count, terms[output])
+
+
+@_compile
+def _set_vectors(messages, directions, filters, lower, shares, count, scalars, terms):
+    """Set what each edge adds to the components of the vectors, (V_out · D, E)."""
+    dim = len(directions)
+    vectors = (filters.shape[1] - scalars) // 2
+    along = np.empty_like(directions[0])
+    for output in range(len(filters)):
+        along[:] = 0
+        for c in range(scalars + vectors):  # directed scalars and projections, between which stand the vectors
+            of = filters[output, c if c < scalars else c + vectors]
+            _add_read(of, lower, shares, messages[c], count, along)
+        for axis in range(dim):
+            component = terms[output * dim + axis]
+            for k in range(count):
+                component[k] = along[k] * directions[axis, k]
+            for v in range(vectors):
+                message = messages[scalars + vectors + v * dim + axis]
+                _add_read(filters[output, scalars + v], lower, shares, message, count, component)
+
+
+@_compile
+def _add_to_rows(terms, start, end, row, splits, output):
+    """Add terms (C_out, E) of the edges from `start` up to `end`, the first of which is `row`'s; returns the last's."""
+    edge = start
+    while edge < end:
+        while splits[row + 1] <= edge:
+            row += 1
+        stop = min(splits[row + 1], end)
+        for c in range(output.shape[1]):
+            total = output[row, c]
+            for k in range(uintp(edge - start), uintp(stop - start)):
+                total += terms[c, k]
+            output[row, c] = total
+        edge = stop
+    return row

@@ -1,0 +1,132 @@
+"""The chart of a study: error against time per frame, for print and notebooks. `interactive` has the one to hover over.
+
+Finalists stand out, with intervals; trials and closed forms of the search are small and faded.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+import seaborn as sns
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+
+from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
+from cconv.report.tables import ANALYTIC, speed_accuracy_table
+
+_MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
+
+
+def speed_accuracy_chart(summary: Mapping) -> Figure:
+    """Error against time per frame, log axes: finalists, search, front, analytic SPH.
+
+    Vertical bars are 95 % intervals over seeds and test units, horizontal bars the quartiles of the timing. Each
+    finalist is named in the margin, at the end of a thin line from its point. Trials of the search have validation
+    errors and mostly estimated times; those that were stopped are hollow.
+    """
+    points = speed_accuracy_table(summary)
+    finalists = points[points["kind"] == "finalist"].sort_values("error", ascending=False)
+    with sns.axes_style("whitegrid"):
+        figure = Figure(figsize=(10.5, max(5.5, 0.42 * len(finalists))), layout="constrained")
+        axes = figure.subplots()
+    axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel="error (normalized MSE)")
+    _draw_search(axes, points[points["kind"] == "search"])
+    _draw_front(axes, summary, finalists)
+    for row in finalists.itertuples():
+        _draw_finalist(axes, row)
+    axes.set_ylim(*error_range(points))
+    _draw_analytic(axes, points[points["kind"] == "analytic"])
+    _name_in_margin(axes, finalists)
+    for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        which(LogFormatter(minor_thresholds=(1.5, 0.6)))
+    threads = summary["finalists"][0]["cost"]["threads"]
+    axes.set_title(f"{summary['study']}: error against cost ({threads} thread{'s' * (threads > 1)})")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    return figure
+
+
+def error_range(points: pd.DataFrame) -> tuple[float, float]:
+    """Lower and upper end of the error axis: all finalists, and trials up to ten times the worst of them."""
+    finalists = points[points["kind"] == "finalist"]
+    highest = finalists[["error", "error_high"]].max(axis=None)
+    errors = points.loc[points["error"].between(0, 10 * highest, inclusive="neither"), "error"]
+    lowest = min(errors.min(), finalists["error_low"][finalists["error_low"] > 0].min())
+    return lowest / 3, 2 * max(errors.max(), highest)
+
+
+def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
+    colors = stage_colors(list(search["group"].unique()))
+    for stage, trials in search.groupby("group", sort=False):
+        filled = trials["outcome"] == "completed"
+        style = {"s": 16, "alpha": 0.5, "linewidths": 0.8, "edgecolors": colors[stage], "zorder": 2}
+        axes.scatter(trials["ms"][filled], trials["error"][filled], color=colors[stage], label=stage, **style)
+        label = None if filled.any() else stage
+        axes.scatter(trials["ms"][~filled], trials["error"][~filled], facecolors="none", label=label, **style)
+    if (search["outcome"] != "completed").any():
+        axes.scatter([], [], s=16, facecolors="none", edgecolors="0.5", label="stopped early")
+
+
+def _draw_front(axes: Axes, summary: Mapping, finalists: pd.DataFrame) -> None:
+    front = finalists[finalists["on_front"]].sort_values("ms")
+    axes.step(front["ms"], front["error"], where="post", color="0.35", lw=1.2, zorder=3, label="front")
+    attainment = pd.DataFrame(summary.get("front", {}).get("attainment", []))
+    if not attainment.empty:
+        ms, low, high = (attainment[name].astype(float) for name in ("ms_per_frame", "low", "high"))
+        axes.fill_between(ms, low, high, step="post", color="0.5", alpha=0.2, lw=0, label="front over seeds")
+
+
+def _draw_finalist(axes: Axes, row) -> None:
+    marker, size = _MARKERS[row.group]
+    axes.errorbar(
+        row.ms,
+        row.error,
+        xerr=[[max(row.ms - row.ms_low, 0)], [max(row.ms_high - row.ms, 0)]],
+        yerr=[[max(row.error - row.error_low, 0)], [max(row.error_high - row.error, 0)]],
+        fmt=marker,
+        markersize=size,
+        color=MARKED[row.group],
+        markeredgecolor="white",
+        ecolor=MARKED[row.group],
+        capsize=3,
+        zorder=5,
+    )
+
+
+def _draw_analytic(axes: Axes, analytic: pd.DataFrame) -> None:
+    for row in analytic.itertuples():
+        edge = axes.get_ylim()[0]
+        axes.plot(row.ms, edge, "^", color=ANALYTIC_COLOR, markersize=10, clip_on=False, zorder=6)
+        place = {"xytext": (9, 6), "textcoords": "offset points", "fontsize": 8}
+        axes.annotate(f"{ANALYTIC} (error 0)", (row.ms, edge), color=ANALYTIC_COLOR, **place)
+
+
+def _name_in_margin(axes: Axes, finalists: pd.DataFrame) -> None:
+    """Names at the right, in the order of the errors, so that no two of them overlap."""
+    low, high = np.log10(axes.get_ylim())
+    heights = spread((np.log10(finalists["error"]) - low) / (high - low), gap=0.98 / max(11, len(finalists)))
+    for row, height in zip(finalists.itertuples(), heights, strict=True):
+        mark = "" if row.group in ("finalist", row.name) else f" ({row.group})"
+        axes.annotate(
+            f"{row.name}{mark}\n{row.error:.3g} · {row.ms:.3g} ms · {row.num_parameters:,.0f} parameters",
+            (row.ms, row.error),
+            xytext=(1.02, height),
+            textcoords="axes fraction",
+            va="center",
+            fontsize=7.5,
+            color=MARKED[row.group],
+            arrowprops={"arrowstyle": "-", "color": "0.75", "lw": 0.7, "shrinkB": 5},
+            annotation_clip=False,
+        )
+
+
+def spread(wanted: pd.Series, gap: float) -> list[float]:
+    """Heights in descending order from 1 to 0, at least `gap` apart, near the wanted ones (descending)."""
+    heights: list[float] = []
+    for height in wanted:
+        heights.append(min(height, heights[-1] - gap) if heights else min(height, 1.0))
+    floor = 0.0
+    for number in reversed(range(len(heights))):
+        heights[number] = max(heights[number], floor)
+        floor = heights[number] + gap
+    return heights

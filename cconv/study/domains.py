@@ -1,0 +1,200 @@
+"""Domains of hyperparameters and the conditions under which they are active, whatever they are hyperparameters of."""
+
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from cconv.errors import did_you_mean
+from cconv.validation import StrictModel
+
+Value = bool | int | float | str
+
+
+def _at(where: tuple[str, ...], problem: str, came: object) -> ValidationError:
+    """A validation error at a key of the space."""
+    kind = PydanticCustomError("condition", "{problem}", {"problem": problem})
+    return ValidationError.from_exception_data("SearchSpace", [InitErrorDetails(type=kind, loc=where, input=came)])
+
+
+class _Parameter(StrictModel):
+    """What all domains share: the reason, and `when`, the values of other parameters that make this one active."""
+
+    reason: str
+    when: dict[str, Annotated[list[Value], Field(min_length=1)]] = {}
+
+
+class Choice(_Parameter):
+    """One of a few values, without order."""
+
+    type: Literal["choice"]
+    values: list[Value] = Field(min_length=1)
+    baseline: Value
+
+    @model_validator(mode="after")
+    def _baseline_is_listed(self) -> "Choice":
+        if self.baseline not in self.values:
+            raise ValueError(f"the baseline {self.baseline!r} must be one of the values {self.values}")
+        return self
+
+    @property
+    def extremes(self) -> list[Value]:
+        """Values that must all be possible."""
+        return self.values
+
+    def holds(self, value: Value) -> bool:
+        """Whether a value is in the domain."""
+        return value in self.values
+
+
+class _Range(_Parameter):
+    scale: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def _baseline_is_inside(self):
+        low, high = self.range
+        if not low < high:
+            raise ValueError(f"the range [{low}, {high}] must have its lower end first")
+        if self.scale == "log" and low <= 0:
+            raise ValueError(f"the range [{low}, {high}] must be positive on a log scale")
+        if not low <= self.baseline <= high:
+            raise ValueError(f"the baseline {self.baseline} must lie in the range [{low}, {high}]")
+        return self
+
+    @property
+    def extremes(self) -> list[Value]:
+        """Values that must all be possible."""
+        return list(self.range)
+
+
+class IntRange(_Range):
+    """A whole number, both ends included."""
+
+    type: Literal["int"]
+    range: tuple[int, int]
+    baseline: int
+
+    def holds(self, value: Value) -> bool:
+        """Whether a value is in the domain."""
+        return isinstance(value, int) and self.range[0] <= value <= self.range[1]
+
+
+class FloatRange(_Range):
+    """A real number."""
+
+    type: Literal["float"]
+    range: tuple[float, float]
+    baseline: float
+
+    def holds(self, value: Value) -> bool:
+        """Whether a value is in the domain."""
+        return isinstance(value, int | float) and self.range[0] <= value <= self.range[1]
+
+
+Parameter = Annotated[Choice | IntRange | FloatRange, Field(discriminator="type")]
+
+
+class SearchSpace(StrictModel):
+    """A named set of hyperparameters and their domains.
+
+    A parameter is active where every condition of its `when` holds: the named parameter is active and has one of the
+    listed values. A configuration is an assignment of the active parameters only. No trial may cost more than
+    `max_flops_per_particle`, multiplications and additions of one particle's prediction.
+    """
+
+    name: str
+    description: str
+    max_flops_per_particle: float | None = Field(None, gt=0)
+    parameters: dict[str, Parameter] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _conditions_can_hold(self) -> "SearchSpace":
+        for name, parameter in self.parameters.items():
+            for parent, values in parameter.when.items():
+                if problem := self._problem_of(parent, values):
+                    raise _at(("parameters", name, "when", parent), problem, values)
+        try:
+            self.parents_first  # noqa: B018
+        except CycleError as error:
+            circle = error.args[1]
+            where = ("parameters", circle[0], "when")
+            raise _at(where, f"closes a circle of conditions: {' -> '.join(circle)}", {}) from error
+        return self
+
+    def _problem_of(self, parent: str, values: list[Value]) -> str:
+        """What is wrong with a condition, or ""."""
+        if parent not in self.parameters:
+            known = f"{did_you_mean(parent, self.parameters)} Known: {', '.join(self.parameters)}"
+            return f"names no parameter of the space.{known}"
+        domain = self.parameters[parent]
+        if isinstance(domain, FloatRange):
+            return f"must be on a choice or a whole number, and {parent!r} is a real number"
+        outside = [value for value in values if not domain.holds(value)]
+        return f"lists {outside[0]!r}, which is not in the domain of {parent!r}" if outside else ""
+
+    @property
+    def parents_first(self) -> list[str]:
+        """Names of the parameters, each after those that its conditions name."""
+        return list(TopologicalSorter({name: list(each.when) for name, each in self.parameters.items()}).static_order())
+
+    @property
+    def baseline(self) -> dict[str, Value]:
+        """Baseline value of every parameter that is active in the baseline."""
+        return self.active({name: parameter.baseline for name, parameter in self.parameters.items()})
+
+    def active(self, values: Mapping[str, Value]) -> dict[str, Value]:
+        """The active parameters of an assignment, in the order of the space.
+
+        Args:
+            values: Value of each parameter; those of inactive ones may be missing.
+        """
+        kept: set[str] = set()
+        for name in self.parents_first:
+            if self.is_active(name, {parent: values[parent] for parent in kept}):
+                kept.add(name)
+        return {name: values[name] for name in self.parameters if name in kept}
+
+    def is_active(self, name: str, active: Mapping[str, Value]) -> bool:
+        """Whether a parameter's conditions hold, given the active parameters among those that they name."""
+        when = self.parameters[name].when
+        return all(parent in active and active[parent] in listed for parent, listed in when.items())
+
+    def holds(self, parameters: Mapping[str, Value]) -> bool:
+        """Whether `parameters` are a whole configuration: exactly the active parameters, each in its domain."""
+        known = all(name in self.parameters for name in parameters)
+        whole = all(self.is_active(name, parameters) == (name in parameters) for name in self.parameters)
+        return known and whole and all(self.parameters[name].holds(value) for name, value in parameters.items())
+
+
+def narrowed(space: SearchSpace, domains: Mapping[str, Parameter]) -> SearchSpace:
+    """The space with other domains for some parameters.
+
+    Conditions on values that are gone lose them; a parameter that can no longer become active is left out.
+    """
+    parameters = space.parameters | domains
+    kept: dict[str, Parameter] = {}
+    for name in space.parents_first:
+        when = {
+            parent: [value for value in values if parent in kept and kept[parent].holds(value)]
+            for parent, values in parameters[name].when.items()
+        }
+        if all(when.values()):
+            kept[name] = parameters[name].model_copy(update={"when": when})
+    return space.model_copy(update={"parameters": {name: kept[name] for name in parameters if name in kept}})
+
+
+def fixed(space: SearchSpace, name: str) -> SearchSpace:
+    """The space with one parameter held at its baseline, e.g. "boundary" in a scene without walls."""
+    if name not in space.parameters:
+        return space
+    parameter = space.parameters[name]
+    only = Choice(
+        type="choice",
+        values=[parameter.baseline],
+        baseline=parameter.baseline,
+        reason=parameter.reason,
+        when=parameter.when,
+    )
+    return narrowed(space, {name: only})

@@ -1,0 +1,240 @@
+"""Trainings side by side with Ray Tune, on this machine or on a cluster."""
+
+import errno
+import faulthandler
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+os.environ.update(
+    RAY_AUTH_MODE="disabled",  # tokens would be written to the home folder
+    RAY_USAGE_STATS_ENABLED="0",
+    RAY_CHDIR_TO_TRIAL_DIR="0",  # data paths stay valid
+    RAY_AIR_NEW_OUTPUT="0",  # its boxes are printed even when silent
+    RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="0",  # leave the accelerators' variables alone
+    TUNE_DISABLE_SIGINT_HANDLER="1",  # Ctrl-C is ours
+    TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # our records are the truth
+    TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S="0",
+    TUNE_GLOBAL_CHECKPOINT_S="1000000",  # Ray's own state is never restored
+    TUNE_WARN_THRESHOLD_S="60",
+)
+
+import ray  # noqa: E402, its settings are read at import
+from ray import tune  # noqa: E402
+from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
+from ray.tune.search import Searcher  # noqa: E402
+
+from cconv.errors import ConfigError  # noqa: E402
+from cconv.study.config import StudyConfig, TrainingConfig  # noqa: E402
+from cconv.study.problem import Problem, provenance  # noqa: E402
+from cconv.study.records import TrialFolder  # noqa: E402
+from cconv.study.trial import run_trial  # noqa: E402
+from cconv.study.trial_queue import Job, TrialQueue  # noqa: E402
+
+OBJECT_STORE_BYTES = 2**30
+RESTARTS = 2  # of a training whose process or node died; it goes on from its last evaluation
+HANGING = 2.0  # times its limit after which a training's process is ended from outside
+DISK_FULL = "disk full"
+
+
+@contextmanager
+def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | None = None) -> Iterator["RayPool"]:
+    """A private Ray on this machine with a core a training, or the cluster at `address`; its files go when it ends.
+
+    Raises:
+        ConfigError: If there is no cluster at the address.
+    """
+    folder = folder.absolute()
+    settings = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        if address is None:
+            own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+            ray.init(num_cpus=study.concurrency, **own, **settings)
+        else:
+            ray.init(address=address, **settings)
+        yield RayPool(study, problem, folder)
+    except ConnectionError as error:
+        raise ConfigError(f"--address {address}: no Ray cluster there; start one with `ray start --head`.") from error
+    finally:
+        ray.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class RayPool:
+    """Runs the trainings of a stage.
+
+    Args:
+        study: The study.
+        problem: What all trainings share; sent to every node once.
+        folder: Ray's own files, which nothing of ours reads; on a cluster on the storage that all nodes share.
+    """
+
+    def __init__(self, study: StudyConfig, problem: Problem, folder: Path):
+        self._study, self._folder = study, folder
+        self._shared = ray.put((study, problem))
+
+    @property
+    def concurrency(self) -> int:
+        """Trainings at once: as many as the pool has cores, unless the study says otherwise."""
+        return self._study.search.concurrency or max(int(ray.cluster_resources().get("CPU", 1)), 1)
+
+    def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
+        """Train every job of a queue that does not stop earlier to the full budget of `training`.
+
+        Raises:
+            ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
+        """
+        shared, cache = self._shared, training.cache_megabytes // self.concurrency
+        training = training.model_copy(update={"cache_megabytes": cache})
+
+        def trainable(config: dict) -> None:
+            _train_and_report(config["job"], stage, training, *ray.get(shared))
+
+        driver = _Driver(queue)
+        tuner = tune.Tuner(
+            tune.with_resources(trainable, {"cpu": 1}),
+            tune_config=tune.TuneConfig(
+                num_samples=-1,
+                max_concurrent_trials=self.concurrency,
+                reuse_actors=True,
+                trial_name_creator=lambda trial: trial.config["job"].name,
+                trial_dirname_creator=lambda trial: trial.trial_id,
+                search_alg=_Jobs(queue),
+                scheduler=_Judge(queue),
+            ),
+            run_config=tune.RunConfig(
+                name=stage,
+                storage_path=str(self._folder),
+                callbacks=[driver],
+                failure_config=tune.FailureConfig(max_failures=RESTARTS),
+                progress_reporter=_Silent(),
+                verbose=0,
+            ),
+        )
+        try:
+            tuner.fit()
+        except Exception as error:
+            raise driver.error or error from None
+        if driver.error:
+            raise driver.error
+
+
+class _NeverRestored:
+    """Ray pickles what drives a run in order to restore it from its own files, which we never do."""
+
+    def __getstate__(self) -> dict:
+        return {}
+
+
+class _Jobs(_NeverRestored, Searcher):
+    """Hands the jobs of a queue to Ray."""
+
+    def __init__(self, queue: TrialQueue):
+        super().__init__()
+        self._queue = queue
+
+    def suggest(self, trial_id: str) -> dict | str:
+        """The next job, when a place is free."""
+        job = self._queue.next()
+        return Searcher.FINISHED if job is None else {"job": job}
+
+    def on_trial_complete(self, trial_id: str, result: dict | None = None, error: bool = False) -> None:
+        """Nothing: the queue hears it from the driver."""
+
+    def save(self, checkpoint_path: str) -> None:
+        """Nothing: the records are what a run is resumed from."""
+
+
+class _Judge(_NeverRestored, FIFOScheduler):
+    """Stops a trial when the queue says so."""
+
+    def __init__(self, queue: TrialQueue):
+        super().__init__()
+        self._queue = queue
+
+    def on_trial_result(self, tune_controller, trial, result: dict) -> str:
+        """Ask the queue after an evaluation; a last word of the training is none."""
+        goes_on = result["outcome"] is not None or self._queue.on_result(str(trial), result)
+        return TrialScheduler.CONTINUE if goes_on else TrialScheduler.STOP
+
+
+class _Driver(_NeverRestored, tune.Callback):
+    """Tells the queue how trainings end."""
+
+    def __init__(self, queue: TrialQueue):
+        self._queue = queue
+        self.error: Exception | None = None
+
+    def on_trial_complete(self, iteration, trials, trial, **info) -> None:
+        """A training said how it ended, or was stopped after its last evaluation."""
+        last = trial.last_result
+        if last["outcome"] == DISK_FULL:
+            self.error = ConfigError(
+                f"{trial.config['job'].folder}: {last['reason']}; make room, then `cconv study resume`."
+            )
+            raise self.error
+        self._end(trial, last["outcome"] or self._queue.outcome_after(last), last["reason"])
+
+    def on_trial_error(self, iteration, trials, trial, **info) -> None:
+        """The training's process or node died too often."""
+        self._end(trial, "failed", "its process died")
+
+    def _end(self, trial, outcome: str, reason: str) -> None:
+        try:
+            self._queue.on_end(str(trial), outcome, reason)
+        except OSError as error:
+            self.error = error
+            raise
+
+
+class _Silent(tune.ProgressReporter):
+    def should_report(self, trials, done=False):
+        return False
+
+    def report(self, trials, done, *sys_info):
+        return None
+
+
+def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem) -> None:
+    """Train a job; every evaluation is reported, then how it ended if the training itself knows."""
+    torch.set_num_threads(1)
+    limit = study.search.trial_seconds
+    faulthandler.dump_traceback_later(HANGING * limit, exit=True)
+    last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
+    outcome, reason = None, ""
+    try:
+        trial = run_trial(
+            problem,
+            job.parameters,
+            study.network,
+            training,
+            TrialFolder(job.folder),
+            stage=stage,
+            init_seed=job.init_seed,
+            data_seed=study.seeds.data,
+            provenance=provenance(study),
+            seconds_limit=limit,
+        )
+        for last in trial:
+            tune.report(last | {"outcome": None, "reason": ""})
+        if not last["diverged"] and last["updates"] < training.updates:
+            outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
+    except Exception as error:
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        outcome, reason = DISK_FULL if full else "failed", str(error) or type(error).__name__
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+    if outcome is not None:
+        _record_what_failed(job, stage, outcome)
+        tune.report(last | {"outcome": outcome, "reason": reason})
+
+
+def _record_what_failed(job: Job, stage: str, outcome: str) -> None:
+    folder = TrialFolder(job.folder)
+    if outcome == "failed" and not folder.started:  # it failed before it could say what it is
+        known = {"stage": stage, "parameters": job.parameters, "init_seed": job.init_seed}
+        folder.start(known | {"num_parameters": None, "flops_per_particle": None})

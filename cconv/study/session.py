@@ -1,0 +1,74 @@
+"""What all stages of a run share."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from cconv.data.dataset import Dataset
+from cconv.errors import ConfigError
+from cconv.study.config import StudyConfig
+from cconv.study.costs import CostCounter
+from cconv.study.observer import Observer
+from cconv.study.problem import Problem
+from cconv.study.records import RunFolder, TrialRecord
+from cconv.study.space import SearchSpace, load_space
+from cconv.study.stages import reads_of
+
+BASELINE = "baseline"
+
+Progress = Callable[[Iterable, str], Iterable]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """A study that runs in its folder.
+
+    Attributes:
+        study: The study.
+        space: Its search space.
+        dataset: Its data.
+        problem: Scene, task, training and validation samples.
+        run: Where everything is recorded.
+        observer: Sees the trials as they run.
+        mirror: Repeats searches in Optuna's storage.
+        start_pool: Gives the `RayPool`; starts it at the first call.
+        count_cost: Counts the cost of a configuration, before anything is built.
+        progress: Wraps an iterable to show progress, given a label.
+    """
+
+    study: StudyConfig
+    space: SearchSpace
+    dataset: Dataset
+    problem: Problem
+    run: RunFolder
+    observer: Observer
+    mirror: Observer
+    start_pool: Callable
+    count_cost: CostCounter
+    progress: Progress
+
+    def read(self, stage: str, *kinds: str) -> list[TrialRecord]:
+        """Records of the stages that a stage reads, of some kinds only if any are named."""
+        stages = self.study.stages
+        names = [name for name in reads_of(stages, stage) if not kinds or stages[name].kind in kinds]
+        return [record for name in names for record in self.run.trials_of(name)]
+
+    def seed_of(self, stage: str) -> int:
+        """Seed of a stage's draws; no two stages share one."""
+        return self.study.seeds.search + list(self.study.stages).index(stage)
+
+    def space_of(self, stage: str) -> SearchSpace:
+        """The study's space, or the one that an earlier stage refined for this one."""
+        refined = self.study.stages[stage].space
+        return self.space if refined is None else load_space(self.run.path / "stages" / f"{refined}.toml")
+
+    def affordable(self, parameters: Mapping) -> bool:
+        """Whether a configuration is below the space's cap on cost, and possible in this scene."""
+        cap = self.space.max_flops_per_particle
+        try:
+            return cap is None or self.count_cost(parameters).flops_per_particle <= cap
+        except ConfigError:
+            return False
+
+    def observers(self, mirrored: bool) -> Sequence[Observer]:
+        """Who sees the trials of a stage."""
+        return [self.observer, self.mirror] if mirrored else [self.observer]

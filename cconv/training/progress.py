@@ -1,0 +1,73 @@
+"""Where a training stands, on disk, so that it goes on after a kill as if nothing had happened."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from cconv.errors import DataError
+from cconv.training.field_model import FieldModel
+
+
+@dataclass
+class Progress:
+    """Optimiser and counts of a training; the loop moves them on.
+
+    Attributes:
+        optimizer: Adam over the model's parameters.
+        updates: Gradient updates done.
+        seconds: Time spent on them, evaluations included.
+    """
+
+    optimizer: torch.optim.Adam
+    updates: int = 0
+    seconds: float = 0.0
+
+
+def begin(model: FieldModel) -> Progress:
+    """The start of a training."""
+    return Progress(torch.optim.Adam(model.parameters()))
+
+
+def save_progress(path: Path, model: FieldModel, progress: Progress) -> None:
+    """Write weights, Adam's moments and counts to one safetensors file, whole or not at all."""
+    part = path.with_name(f".{path.name}-{os.getpid()}")
+    counts = {"updates": progress.updates, "seconds": progress.seconds}
+    tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
+    for name, parameter in model.named_parameters():
+        moments = progress.optimizer.state.get(parameter, {})
+        tensors |= {f"adam.{key}.{name}": value for key, value in moments.items()}
+    try:
+        save_file({name: value.contiguous() for name, value in tensors.items()}, part, {"counts": json.dumps(counts)})
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def load_progress(path: Path, model: FieldModel) -> Progress:
+    """Set the model's weights to those of the file, and give its optimiser and counts.
+
+    Raises:
+        DataError: If the file is damaged or belongs to another model.
+    """
+    progress = begin(model)
+    try:
+        with safe_open(path, framework="pt") as file:
+            counts = json.loads(file.metadata()["counts"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
+        prefix = "weights."
+        weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        model.load_state_dict(weights)
+        for name, parameter in model.named_parameters():
+            if f"adam.step.{name}" in tensors:  # one that no loss depends on has none
+                moments = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+                progress.optimizer.state[parameter] = moments
+    except (SafetensorError, RuntimeError, KeyError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{path}: no progress of this training ({reason}); delete it to begin again.") from error
+    progress.updates, progress.seconds = counts["updates"], counts["seconds"]
+    return progress

@@ -1,0 +1,314 @@
+"""Time of predicting a frame: the published network beside single radial layers, growth with particles, the cost model.
+
+    python experiments/benchmarks/inference.py --data FOLDER [--out FOLDER] [--before FOLDER]
+
+One thread. Models take turns, so that a change of the machine's speed meets all of them alike; medians and quartiles.
+`--before` names a checkout of an earlier state: it and this one take turns too, each in a process of its own, and a
+ratio compares two frames of one turn. Writes `inference.json` and `inference.png`. Weights are drawn at random: they do
+not change the time. The data are the dam break of DPI-Net.
+"""
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import torch
+
+from cconv import open_dataset, radius_graph
+from cconv.data.targets import Sample, make_sample
+from cconv.data.trajectory import Scene
+from cconv.domain import Box
+from cconv.sph import CubicSpline
+from cconv.training.checkpoint import load_model, save_model
+from cconv.training.field_model import FieldModel, NetworkConfig, build_field_model
+
+SPACING = 0.05
+LAYER = {"layers": 1, "basis": "radial", "message": "difference", "relative_cutoff": 2.0, "window": "none"}
+COMPARED = {
+    "published network": {},
+    "radial layer": LAYER,
+    "radial layer, no walls": LAYER | {"boundary": False, "density": False},
+}
+CHECKED = COMPARED | {
+    "grid layer": {"layers": 1},
+    "grid layer, identity": {"layers": 1, "mapping": "identity", "window": "none"},
+    "grid layer, K = 6, no walls": {"layers": 1, "kernel_size": 6, "boundary": False},
+    "2 grid layers of 8": {"layers": 2, "first_channels": 8},
+    "2 grid layers, nearest cell": {"layers": 2, "first_channels": 16, "interpolation": "nearest_neighbor"},
+    "3 grid layers of 16": {"layers": 3, "first_channels": 16, "hidden_channels": 16},
+    "3 grid layers, R = 1.5, no walls": {"layers": 3, "mapping": "identity", "relative_cutoff": 1.5, "boundary": False},
+    "4 grid layers, K = 3": {"kernel_size": 3, "first_channels": 16, "hidden_channels": 32},
+    "radial layer, poly6, R = 2.5": LAYER | {"window": "poly6", "relative_cutoff": 2.5, "boundary": False},
+    "2 radial layers of 8": {"layers": 2, "basis": "radial", "first_channels": 8},
+    "2 radial layers of 32, no walls": {"layers": 2, "basis": "radial", "first_channels": 32, "boundary": False},
+    "3 radial layers of 8": {"layers": 3, "basis": "radial", "first_channels": 8, "hidden_channels": 8},
+}
+SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000, 50_000) for periodic in (False, True)]
+SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
+
+
+def frame_of(folder: Path) -> tuple[Scene, Sample]:
+    dataset = open_dataset(folder, mass=0.125, particle_spacing=SPACING, frame_dt=1 / 60)
+    frame = dataset.trajectory("train", 0)[20]
+    return dataset.scene, make_sample(frame, dataset.scene, "density_rate", CubicSpline(SPACING, 3))
+
+
+def model_of(settings: Mapping, scene: Scene, sample: Sample) -> FieldModel:
+    return build_field_model(NetworkConfig(**settings), scene, "density_rate", "cubic_spline", SPACING, [sample]).eval()
+
+
+def cloud(dim: int, count: int, periodic: bool) -> tuple[torch.Tensor, Box]:
+    """A jittered lattice of unit spacing in no particular order, in its box."""
+    generator, side = torch.Generator().manual_seed(0), math.ceil(count ** (1 / dim))
+    lattice = torch.cartesian_prod(*[torch.arange(side) + 0.5] * dim).reshape(-1, dim)
+    chosen = lattice[torch.randperm(len(lattice), generator=generator)[:count]]
+    return chosen + 0.3 * (torch.rand(chosen.shape, generator=generator) - 0.5), Box([0] * dim, [side] * dim, periodic)
+
+
+class Calls:
+    """What a state of the code is timed on, by name; each call returns its parts' times in ms."""
+
+    def __init__(self, folder: Path, searches: list[tuple[int, int, bool]]):
+        scene, sample = frame_of(folder)
+        self.known = set(NetworkConfig.model_fields)
+        self.calls = {}
+        for name, settings in COMPARED.items():
+            inputs, network = sample.inputs, {key: value for key, value in settings.items() if key in self.known}
+            if len(network) < len(settings):  # a state that knows no models without walls: a scene without
+                inputs = type(inputs)(**vars(inputs) | {"boundary_positions": None, "boundary_features": None})
+            model = model_of(network, scene, Sample(**vars(sample) | {"inputs": inputs}))
+            self.calls[name] = lambda model=model, inputs=inputs: self.predict(model, inputs)
+        for search in searches:
+            positions, box = cloud(*search)
+            self.calls[json.dumps(search)] = lambda positions=positions, box=box: self.search(positions, box)
+
+    @torch.no_grad()
+    def predict(self, model: FieldModel, inputs) -> tuple[float, float]:
+        start = time.perf_counter()
+        geometry = model.geometry(inputs)
+        middle = time.perf_counter()
+        model(inputs, geometry)
+        return 1e3 * (middle - start), 1e3 * (time.perf_counter() - middle)
+
+    def search(self, positions: torch.Tensor, box: Box) -> tuple[float, float]:
+        start = time.perf_counter()
+        radius_graph(positions, 2.0, box)
+        return 1e3 * (time.perf_counter() - start), 0.0
+
+
+def serve(folder: Path, searches: list) -> None:
+    """Time what is named on each line of standard input."""
+    torch.set_num_threads(1)
+    calls = Calls(folder, searches).calls
+    for line in sys.stdin:
+        print(json.dumps(calls[json.loads(line)]()), flush=True)
+
+
+class State:
+    """A process of its own for a checkout of the code."""
+
+    def __init__(self, checkout: Path, data: Path, searches: list):
+        command = [sys.executable, __file__, "--data", str(data.resolve()), "--serve", json.dumps(searches)]
+        environment = os.environ | {"PYTHONPATH": str(checkout.resolve())}
+        self.process = subprocess.Popen(
+            command, env=environment, cwd=checkout, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+
+    def time(self, name: str) -> list[float]:
+        print(json.dumps(name), file=self.process.stdin, flush=True)
+        return json.loads(self.process.stdout.readline())
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def quartiles(values: list[float]) -> dict[str, float]:
+    low, median, high = statistics.quantiles(values, n=4)
+    return {"median": median, "low": low, "high": high}
+
+
+def compare(checkouts: Mapping[str, Path], data: Path, searches: list, rounds: int) -> dict:
+    """Times of each call in each state, and ratios within a round; the first round is a warm-up."""
+    states = {name: State(checkout, data, searches) for name, checkout in checkouts.items()}
+    names = [*COMPARED, *map(json.dumps, searches)]
+    times = {name: {state: [] for state in states} for name in names}
+    for turn in range(rounds + 1):
+        for name in names:
+            for state, process in states.items():
+                parts = process.time(name)
+                if turn > 0:
+                    times[name][state].append(parts)
+    for process in states.values():
+        process.close()
+    total = {name: {state: [sum(t) for t in times[name][state]] for state in states} for name in names}
+    rows = {}
+    for name in names:
+        rows[name] = {
+            state: {"ms": quartiles(total[name][state])}
+            | {
+                part: statistics.median(p)
+                for part, p in zip(("geometry_ms", "network_ms"), zip(*parts, strict=True), strict=True)
+            }
+            for state, parts in times[name].items()
+        }
+        if "before" in states:
+            rows[name]["before / now"] = ratio(total[name]["before"], total[name]["now"])
+        if name in COMPARED:
+            rows[name]["published now / this now"] = ratio(total["published network"]["now"], total[name]["now"])
+    return rows
+
+
+def ratio(numerators: list[float], denominators: list[float]) -> dict[str, float]:
+    return quartiles([a / b for a, b in zip(numerators, denominators, strict=True)])
+
+
+def measure_checks(data: Path, rounds: int) -> dict:
+    """Growth of the compared models, and the cost model's predictions for many."""
+    from cconv.evaluation.cost import measure_costs, measure_growth, surroundings_of
+    from cconv.evaluation.cost_model import estimate
+    from cconv.evaluation.time_model import check_cost_model
+
+    scene, sample = frame_of(data)
+    around = surroundings_of(sample.inputs, 2.0, SPACING)
+    with tempfile.TemporaryDirectory() as folder:
+        saved = {name: Path(folder) / str(place) for place, name in enumerate(CHECKED)}
+        for name, path in saved.items():
+            save_model(model_of(CHECKED[name], scene, sample), path, {})
+        compared = {name: saved[name] for name in COMPARED}
+        growth = measure_growth(compared, load_model, threads=1, repeats=max(2, rounds // 4))
+        costs = measure_costs(saved, load_model, [sample.inputs], threads=1, repeats=max(2, rounds // 2))
+    counted = {
+        name: estimate(
+            NetworkConfig(**settings).model_dump(), dim=3, vector_output=False, boundary_channels=3, surroundings=around
+        )
+        for name, settings in CHECKED.items()
+    }
+    check = check_cost_model(counted, {name: cost.us_per_particle for name, cost in costs.items()})
+    return {
+        "growth": {name: asdict(each) for name, each in growth.items()},
+        "costs": {name: asdict(cost) for name, cost in costs.items()},
+        "estimates": {name: asdict(each) for name, each in counted.items()},
+        "cost_model": asdict(check),
+    }
+
+
+def draw(results: dict, path: Path) -> None:
+    figure, panels = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    draw_models(panels[0, 0], results["compared"])
+    draw_searches(panels[0, 1], results["compared"])
+    draw_growth(panels[1, 0], results["growth"])
+    draw_check(panels[1, 1], results["cost_model"])
+    figure.suptitle(f"One thread, float32; frame of {results['num_particles']:,} fluid particles, {results['machine']}")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def draw_models(panel: plt.Axes, compared: dict) -> None:
+    states = [state for state in ("before", "now") if state in compared["published network"]]
+    for place, name in enumerate(COMPARED):
+        for step, state in enumerate(states):
+            row, at = compared[name][state], place + 0.4 * step
+            panel.barh(at, row["geometry_ms"], 0.36, color="C0", alpha=0.5 + 0.5 * (state == "now"))
+            panel.barh(at, row["network_ms"], 0.36, row["geometry_ms"], color="C1", alpha=0.5 + 0.5 * (state == "now"))
+            panel.text(
+                sum((row["geometry_ms"], row["network_ms"])), at, f" {state} {row['ms']['median']:.3g} ms", va="center"
+            )
+    panel.set_yticks([place + 0.2 for place in range(len(COMPARED))], list(COMPARED))
+    panel.invert_yaxis()
+    panel.margins(x=0.25)
+    panel.set(xlabel="ms per frame", title="search and geometry (blue), network (orange)")
+
+
+def draw_searches(panel: plt.Axes, compared: dict) -> None:
+    searches = {tuple(json.loads(name)): row for name, row in compared.items() if name not in COMPARED}
+    for dim in (1, 2, 3):
+        for periodic in (False, True):
+            rows = {count: row for (d, count, p), row in searches.items() if (d, p) == (dim, periodic)}
+            values = [row.get("before / now", row["now"]["ms"]) for row in rows.values()]
+            medians = [value["median"] for value in values]
+            errors = [
+                [value["median"] - value["low"] for value in values],
+                [value["high"] - value["median"] for value in values],
+            ]
+            label = f"{dim}D, {'periodic' if periodic else 'open'}"
+            panel.errorbar(
+                list(rows),
+                medians,
+                errors,
+                marker="o",
+                capsize=2,
+                color=f"C{dim}",
+                label=label,
+                ls="--" if periodic else "-",
+            )
+    has_ratio = all("before / now" in row for row in searches.values())
+    panel.axhline(1, color="black", lw=0.8)
+    panel.set(xscale="log", yscale="log", xlabel="particles", title="neighbour search, cutoff of two spacings")
+    panel.set_ylabel("time before / now" if has_ratio else "ms")
+    panel.legend(fontsize=8)
+
+
+def draw_growth(panel: plt.Axes, growth: dict) -> None:
+    for name, each in growth.items():
+        times = each["times"]
+        panel.plot(
+            [time["num_particles"] for time in times],
+            [time["ms_per_frame"] for time in times],
+            marker="o",
+            label=f"{name}: N^{each['exponent']:.2f}",
+        )
+    panel.set(xscale="log", yscale="log", xlabel="particles", ylabel="ms per frame", title="growth on blocks of fluid")
+    panel.legend(fontsize=8)
+
+
+def draw_check(panel: plt.Axes, check: dict) -> None:
+    measured, predicted = list(check["measured"].values()), list(check["predicted"].values())
+    panel.scatter(measured, predicted, s=18)
+    ends = [0.7 * min(measured + predicted), 1.4 * max(measured + predicted)]
+    panel.plot(ends, ends, color="black", lw=0.8)
+    title = f"cost model: median error {check['median_relative_error']:.0%}, rank {check['rank_correlation']:.2f}"
+    panel.set(
+        xscale="log", yscale="log", xlabel="measured, µs a particle", ylabel="predicted from the others", title=title
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="DeepLagrangianFluids folder of the DPI dam break")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "inference")
+    parser.add_argument("--before", type=Path, help="checkout of an earlier state to compare with")
+    parser.add_argument("--rounds", type=int, default=20, help="timed calls of each")
+    parser.add_argument("--serve", type=json.loads, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.serve is not None:
+        serve(arguments.data, [tuple(search) for search in arguments.serve])
+        return
+    checkouts = {"before": arguments.before} if arguments.before else {}
+    checkouts["now"] = Path(__file__).parents[2]
+    results = {
+        "machine": f"{os.cpu_count()} cores, torch {torch.__version__}",
+        "num_particles": frame_of(arguments.data)[1].inputs.num_particles,
+        "threads": 1,
+        "compared": compare(checkouts, arguments.data, SEARCHES, arguments.rounds),
+        **measure_checks(arguments.data, arguments.rounds),
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "inference.json").write_text(json.dumps(results, indent=1) + "\n")
+    draw(results, arguments.out / "inference.png")
+    for name in COMPARED:
+        print(name, json.dumps(results["compared"][name]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+import math
+from dataclasses import replace as with_changes
+
+import pytest
+import torch
+from systems import kernel, periodic_frame, periodic_scene, with_walls
+
+from cconv.data.targets import make_sample
+from cconv.evaluation.cost import flops_per_particle, surroundings_of
+from cconv.evaluation.cost_model import Surroundings, ball_volume, estimate
+from cconv.nn import ContinuousConv
+from cconv.training.field_model import NetworkConfig, build_field_model
+
+SEVERAL = {"layers": 3, "first_channels": 5, "hidden_channels": 7}
+GRID = [
+    NetworkConfig(**SEVERAL),
+    NetworkConfig(**SEVERAL, interpolation="nearest_neighbor", density=False),
+    NetworkConfig(layers=1, kernel_size=3, boundary=False, relative_cutoff=1.7),
+]
+RADIAL = [
+    NetworkConfig(basis="radial", layers=1, message="difference", radial_terms=8, density=False),
+    NetworkConfig(basis="radial", **SEVERAL, boundary=False),
+    NetworkConfig(basis="radial", layers=3, first_channels=3, hidden_channels=24, radial_terms=5),
+]
+
+
+def built(network, task, normals, generator):
+    frame = with_walls(periodic_frame(generator), normals)
+    scene = periodic_scene()
+    sample = make_sample(frame, scene, task, kernel(scene))
+    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, [sample])
+    return model, sample.inputs
+
+
+def counted_on(model, inputs):
+    """Operations of a built model, from its weights and the pairs of its geometry."""
+    geometry, network = model.geometry(inputs), model.network
+    convs = [(conv, geometry.fluid) for conv in network.convs]
+    if network.boundary_conv is not None:
+        convs.append((network.boundary_conv, geometry.boundary))
+    total = sum(of_conv(*conv) for conv in convs) / inputs.num_particles
+    for dense in network.dense:
+        for name, weights in dense.named_parameters():
+            repeated = model.config.dim if name == "vector_weights" else 1
+            total += 0 if name == "bias" else 2 * repeated * weights.numel()
+    return total
+
+
+def of_conv(conv, geometry):
+    if isinstance(conv, ContinuousConv):
+        return of_reads(conv.filters.flatten(0, -3), geometry.reads)
+    if max(conv.out_channels) > 20:
+        return of_reads(conv.scalar_filters, geometry.reads) + conv.dim * of_reads(conv.vector_filters, geometry.reads)
+    of_scalars, of_vectors = conv.scalar_filters[0], conv.vector_filters[0]
+    vectors, vector_outputs = conv.in_channels[1], conv.out_channels[1]
+    directed = of_vectors.numel() - vectors * vector_outputs
+    reads = of_scalars.numel() + directed + conv.dim * vectors * vector_outputs
+    return 2 * len(geometry.edges) * (3 * reads + conv.dim * (vectors + vector_outputs))
+
+
+def of_reads(filters, reads):
+    _, inputs, outputs = filters.shape
+    products_first = 4 * reads.num_senders * outputs <= reads.num_receivers * inputs
+    read = len(reads.senders) * reads.num_corners * (outputs if products_first else inputs)
+    return 2 * (read + (reads.num_senders if products_first else reads.num_receivers) * filters.numel()) * (outputs > 0)
+
+
+@pytest.mark.parametrize("normals", [True, False])
+@pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
+@pytest.mark.parametrize("network", GRID + RADIAL, ids=lambda network: f"{network.basis}-{network.layers}")
+def test_equals_the_count_on_a_built_model(network, task, normals, generator):
+    model, inputs = built(network, task, normals, generator)
+    assert flops_per_particle(model, inputs) == pytest.approx(counted_on(model, inputs), rel=1e-6)
+
+
+def surroundings():
+    return Surroundings.counted(2.0, 3, neighbors=40.0, boundary_neighbors=18.0, boundary_points=3.0)
+
+
+def cost(network=None, **changes):
+    settings = NetworkConfig(**(network or {}) | changes).model_dump()
+    return estimate(settings, dim=3, vector_output=False, boundary_channels=3, surroundings=surroundings())
+
+
+@pytest.mark.parametrize("basis", ["grid", "radial"])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("layers", (1, 2, 3, 4)),
+        ("first_channels", (4, 8, 16, 32)),
+        ("hidden_channels", (32, 64, 128)),
+        ("relative_cutoff", (1.5, 2.0, 2.5)),
+        ("boundary", (False, True)),
+        ("density", (False, True)),
+    ],
+)
+def test_more_of_a_network_costs_more(name, values, basis):
+    costs = [cost(basis=basis, **{name: value}) for value in values]
+    for quantity in ("flops_per_particle", "bytes_per_particle"):
+        counts = [getattr(each, quantity) for each in costs]
+        assert counts == sorted(set(counts))
+
+
+def test_maps_windows_and_norms_move_memory_and_are_no_operations_of_the_network():
+    plain = cost(mapping="identity", window="none")
+    for changes in ({"mapping": "ball_to_cube_radial"}, {"window": "poly6"}, {"normalize": True}):
+        other = cost({"mapping": "identity", "window": "none"} | changes)
+        assert other.flops_per_particle == plain.flops_per_particle
+        assert other.bytes_per_particle > plain.bytes_per_particle
+
+
+def test_networks_without_boundary_do_not_see_walls():
+    settings = NetworkConfig(boundary=False).model_dump()
+    inside = with_changes(surroundings(), boundary_density=0.0, boundary_points=0.0)
+    costs = [
+        estimate(settings, dim=3, vector_output=False, boundary_channels=channels, surroundings=around)
+        for channels, around in ((3, surroundings()), (0, inside))
+    ]
+    assert costs[0] == costs[1]
+
+
+def test_points_within_reach_follow_from_those_counted_at_another_cutoff():
+    """Of a lattice, with an error of the order of its points at the surface of the ball."""
+    lattice = torch.cartesian_prod(*[torch.arange(-6.0, 7.0)] * 3)
+    radii = lattice.norm(dim=1)
+    near, far = (int((radii <= cutoff).sum()) - 1 for cutoff in (3.5, 5.5))
+    around = Surroundings.counted(3.5, 3, near)
+    assert around.fluid_density * ball_volume(5.5, 3) == pytest.approx(far, rel=0.1)
+
+
+def test_volumes_of_balls():
+    assert [ball_volume(2.0, dim) for dim in (1, 2, 3)] == pytest.approx([4.0, 4 * math.pi, 32 / 3 * math.pi])
+
+
+def test_surroundings_are_counted_in_a_frame(generator):
+    _, inputs = built(GRID[0], "density_rate", True, generator)
+    found = surroundings_of(inputs, 1.5, 1 / 8)
+    assert found.fluid_density * ball_volume(1.5, 2) == pytest.approx(
+        8, abs=1
+    )  # of a lattice that is a little jittered
+    assert found.boundary_points == 8 / 64
+    assert 0 < found.boundary_density < found.fluid_density

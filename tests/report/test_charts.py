@@ -1,0 +1,185 @@
+"""Charts show what the tables hold, and labels do not cover each other."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+from summaries import explanation, whole_summary
+
+from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
+from cconv.report.interactive import interactive_chart, interactive_html
+from cconv.report.plots import (
+    ablation_chart,
+    best_so_far_chart,
+    cost_chart,
+    growth_chart,
+    learning_curves_chart,
+    rung_audit_chart,
+    stability_chart,
+    strategies_chart,
+)
+from cconv.report.speed_accuracy import error_range, speed_accuracy_chart, spread
+from cconv.report.tables import ANALYTIC, curves_table, speed_accuracy_table, trials_table
+from cconv.study.records import RunFolder
+
+SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
+
+
+@pytest.fixture
+def run():
+    return RunFolder(SAMPLE)
+
+
+@pytest.fixture
+def summary():
+    return whole_summary(json.loads((SAMPLE / "summary.json").read_text()))
+
+
+def crowded(summary, count):
+    """The summary with `count` finalists of nearly the same error and time."""
+    first = summary["finalists"][0]
+    others = [
+        json.loads(json.dumps(first)) | {"id": f"copy_{number}", "num_parameters": number} for number in range(count)
+    ]
+    return summary | {"finalists": [*summary["finalists"], *others]}
+
+
+def test_static_chart_has_log_axes_every_finalist_and_the_front(summary):
+    (axes,) = speed_accuracy_chart(summary).axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    labels = " ".join(text.get_text() for text in axes.texts)
+    assert all(entry["id"] in labels for entry in summary["finalists"])
+    assert {"front", "front over seeds", "random", "second look"} <= set(axes.get_legend_handles_labels()[1])
+    assert ANALYTIC in labels
+
+
+@pytest.mark.parametrize("copies", [0, 12])
+def test_names_in_the_static_chart_do_not_overlap(summary, copies):
+    figure = speed_accuracy_chart(crowded(summary, copies))
+    figure.draw_without_rendering()
+    names = [text for text in figure.axes[0].texts if "parameters" in text.get_text()]
+    assert len(names) == len(summary["finalists"]) + copies
+    boxes = [Text.get_window_extent(text) for text in names]  # without the lines to the points
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+
+
+def test_heights_keep_order_gap_and_range():
+    for wanted in ([0.5] * 5, [1.4, 0.9, 0.89, 0.1], [0.1, 0.05, 0.0], []):
+        heights = spread(wanted, gap=0.1)
+        assert all(high - low >= 0.1 - 1e-12 for high, low in itertools.pairwise(heights))
+        assert all(0 <= height <= 1 for height in heights)
+    assert spread([0.9, 0.5, 0.2], gap=0.1) == [0.9, 0.5, 0.2]
+
+
+def test_the_error_axis_shows_all_finalists_and_not_what_diverged(summary):
+    summary["search_points"][0]["valid_normalized_mse"] = 1e9
+    points = speed_accuracy_table(summary)
+    low, high = error_range(points)
+    finalists = points[points["kind"] == "finalist"]
+    assert low < finalists["error_low"].min()
+    assert finalists["error_high"].max() < high < 100
+
+
+def test_interactive_chart_shows_every_point_with_its_hyperparameters(summary):
+    figure = interactive_chart(summary)
+    texts = [text for trace in figure.data for text in (trace.hovertext or ())]
+    points = speed_accuracy_table(summary)
+    assert len(texts) == len(points)
+    for name, count in points["name"].value_counts().items():  # a finalist bears the name of the trial that found it
+        assert sum(f"<b>{name}</b>" in text for text in texts) == count
+    for text in texts:
+        assert ANALYTIC in text or ("learning_rate = " in text and "parameters" in text and "ms per frame" in text)
+    assert (figure.layout.xaxis.type, figure.layout.yaxis.type) == ("log", "log")
+
+
+def test_stopped_trials_are_hollow_and_finalists_have_intervals(summary):
+    traces = {trace.name: trace for trace in interactive_chart(summary).data}
+    outcomes = [point["outcome"] for point in summary["search_points"] if point["stage"] == "random"]
+    assert [symbol == "circle" for symbol in traces["random (search)"].marker.symbol] == [
+        outcome == "completed" for outcome in outcomes
+    ]
+    chosen = traces["recommended"]
+    assert chosen.marker.symbol == "star"
+    entry = next(each for each in summary["finalists"] if each["id"] == summary["recommended"]["id"])
+    assert chosen.y[0] + chosen.error_y.array[0] == pytest.approx(entry["test"]["ci95"][1])
+    assert chosen.y[0] - chosen.error_y.arrayminus[0] == pytest.approx(entry["test"]["ci95"][0])
+
+
+def test_interactive_html_holds_its_program_once(summary):
+    html = interactive_html(summary)
+    assert html.count("* plotly.js v") == 1
+    assert "cdn.plot.ly" not in html.split("</script>")[-1]
+
+
+def test_charts_of_the_search_show_the_trials(run):
+    search, finals = learning_curves_chart(curves_table(run)).axes
+    assert len(search.lines) >= len(run.trials())
+    assert len(finals.lines) == sum(len(records) for records in run.retrainings().values())
+    assert best_so_far_chart(trials_table(run)).axes[0].get_yscale() == "log"
+
+
+def test_other_charts_show_their_records(summary):
+    assert len(growth_chart(summary).axes[0].lines) == len(summary["finalists"])
+    assert len(strategies_chart(summary).axes[0].lines) == 2
+    assert [axes.get_title() for axes in rung_audit_chart(summary).axes] == [
+        "rank correlation",
+        "recall of the best",
+        "regret",
+    ]
+    labels = [label.get_text() for label in ablation_chart(summary).axes[0].get_yticklabels()]
+    assert labels == ["baseline", "lost", "layers: 2"]
+
+
+def test_cost_chart_adds_geometry_and_network_fastest_first(summary):
+    (axes,) = cost_chart(summary).axes
+    times = [entry["cost"]["geometry_ms"] + entry["cost"]["network_ms"] for entry in summary["finalists"]]
+    geometry, network = axes.containers
+    ends = [bar.get_x() + bar.get_width() for bar in network]
+    assert ends == pytest.approx(sorted(times), rel=1e-6)
+    assert [bar.get_width() for bar in geometry] == pytest.approx([bar.get_x() for bar in network])
+
+
+def test_points_right_of_the_line_are_the_checks_that_failed(summary):
+    (axes,) = stability_chart(summary).axes
+    *finalists, limit = axes.lines
+    assert set(limit.get_xdata()) == {1}
+    failed = [bool((line.get_xdata() > 1).any()) for line in finalists]
+    assert failed == [not entry["stability"]["stable"] for entry in summary["finalists"]]
+
+
+@pytest.mark.parametrize(("dim", "components"), [(1, 1), (2, 1), (2, 2), (3, 1), (3, 3)])
+def test_what_was_learned_is_drawn_in_all_dimensions(dim, components):
+    arrays = explanation(dim, components)
+    assert len(filters_chart(arrays).axes) == dim + 1
+    titles = [axes.get_title() for axes in fields_chart(arrays).axes]
+    assert titles[0].startswith("analytic")
+    assert titles[1].startswith("predicted")
+
+
+def test_space_is_drawn_as_a_slice_of_two_spacings():
+    arrays = explanation(3, particles=500)
+    drawn = fields_chart(arrays).axes[0].collections[0].get_offsets()
+    depth = arrays["positions"][:, 2]
+    assert len(drawn) == (abs(depth - np.median(depth)) <= 0.1).sum() < 500
+
+
+def test_error_distribution_has_the_models_that_were_explained():
+    arrays = {"baseline": explanation()}
+    (axes,) = error_distribution_chart(arrays, "baseline", "best").axes
+    assert axes.get_legend_handles_labels()[1] == ["baseline"]
+    heights = [patch.get_data().values for patch in axes.patches]
+    assert all(each.sum() == pytest.approx(1) for each in heights)
+
+
+def test_explanations_are_read_by_name_and_never_unpickled(tmp_path):
+    run = RunFolder(tmp_path)
+    assert read_explanations(run) == {}
+    (tmp_path / "explanation").mkdir()
+    np.savez(tmp_path / "explanation" / "best.npz", **explanation())
+    assert str(read_explanations(run)["best"]["task"]) == "density_rate"
+    np.savez(tmp_path / "explanation" / "evil.npz", harm=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        read_explanations(run)

@@ -1,0 +1,119 @@
+"""Tables of a run: a row for each thing recorded, and nothing lost."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from summaries import whole_summary
+
+from cconv.report.tables import (
+    ANALYTIC,
+    curves_table,
+    finalists_table,
+    growth_table,
+    rung_audit_table,
+    speed_accuracy_table,
+    strategies_table,
+    trials_table,
+)
+from cconv.report.verdicts import failures_table, verdict_matrix, verdicts_table
+from cconv.study.records import RunFolder
+
+SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
+
+
+@pytest.fixture
+def run():
+    return RunFolder(SAMPLE)
+
+
+@pytest.fixture
+def summary():
+    return whole_summary(json.loads((SAMPLE / "summary.json").read_text()))
+
+
+def test_trials_table_has_a_row_a_trial_and_its_hyperparameters(run):
+    table = trials_table(run)
+    assert list(table["trial"]) == [record.id for record in run.trials()]
+    assert {"kernel_size", "message", "learning_rate", "outcome", "num_parameters"} <= set(table.columns)
+
+
+def test_curves_table_has_a_row_an_evaluation(run):
+    table = curves_table(run)
+    records = [*run.trials(), *(record for records in run.retrainings().values() for record in records)]
+    assert len(table) == sum(len(record.log) for record in records)
+    assert (table["valid_normalized_mse"] > 0).all()
+
+
+def test_finalists_table_is_sorted_by_error(summary):
+    table = finalists_table(summary)
+    assert table["normalized_mse"].is_monotonic_increasing
+    assert (table["ci95_low"] <= table["normalized_mse"]).all()
+
+
+def test_speed_accuracy_table_has_every_point_with_an_error_once(summary):
+    table = speed_accuracy_table(summary)
+    assert list(table["kind"].unique()) == ["finalist", "search", "analytic"]
+    assert list(table.loc[table["kind"] == "finalist", "name"]) == [entry["id"] for entry in summary["finalists"]]
+    known = [point["id"] for point in summary["search_points"] if point["valid_normalized_mse"] is not None]
+    assert list(table.loc[table["kind"] == "search", "name"]) == known
+    assert set(table.loc[table["on_front"], "name"]) == set(summary["pareto_front"])
+    assert table.loc[table["name"] == ANALYTIC, "error"].item() == 0
+    assert table["ms"].notna().all()
+
+
+def test_marked_finalists_have_groups_of_their_own(summary):
+    other = next(
+        entry for entry in summary["finalists"] if entry["id"] not in ("baseline", summary["recommended"]["id"])
+    )
+    other["id"] = "thesis_best"
+    groups = speed_accuracy_table(summary).set_index("name")["group"]
+    assert groups["baseline"] == "baseline"
+    assert groups["thesis_best"] == "thesis's best"
+    assert groups[summary["recommended"]["id"]] == "recommended"
+
+
+def test_optional_tables_have_a_row_a_record_and_are_empty_without(summary):
+    growth, audit, strategies = growth_table(summary), rung_audit_table(summary), strategies_table(summary)
+    assert len(growth) == 2 * len(summary["finalists"])
+    assert list(audit["updates"]) == [15, 45, 135]
+    assert list(audit["spearman_low"] < audit["spearman"]) == [False, True, True]
+    assert list(strategies["strategy"]) == ["ASHA", "ASHA", "a little, keep the best"]
+    assert all(table({}).empty for table in (growth_table, rung_audit_table, strategies_table))
+
+
+def test_verdicts_agree_with_the_limits(summary):
+    checks = {check.label: check for check in verdict_matrix(summary)}
+    errors = [entry["test"]["normalized_mse"] for entry in summary["finalists"]]
+    assert [cell.passes for cell in checks["frame clumped"].cells] == [error <= 0.05 for error in errors]
+    assert [cell.passes for cell in checks["passes every check"].cells] == [error <= 0.05 for error in errors]
+    assert {cell.text for cell in checks["frame isolated"].cells} == {"–"}
+    assert checks["regime bulk (90 % of the particles)"].limit == 0.5
+
+
+def test_tables_of_verdicts_say_the_same_as_the_matrix(summary):
+    table = verdicts_table(summary).set_index("check")
+    for check in verdict_matrix(summary):
+        assert list(table.loc[check.label].iloc[1:]) == [cell.text for cell in check.cells]
+    failed = [entry["id"] for entry in summary["finalists"] if not entry["stability"]["stable"]]
+    assert list(failures_table(summary)["model"]) == failed
+
+
+def test_verdicts_leave_a_gap_for_finalists_that_were_not_measured(summary):
+    summary["finalists"][0]["stability"] = None
+    for check in verdict_matrix(summary):
+        assert (check.cells[0].text, check.cells[0].passes) == ("–", None)
+        assert len(check.cells) == len(summary["finalists"])
+    for entry in summary["finalists"]:
+        entry["stability"] = None
+    assert verdict_matrix(summary) == []
+
+
+def test_what_notebooks_import_needs_neither_ray_nor_torch():
+    modules = ("tables", "plots", "fields", "verdicts", "speed_accuracy", "interactive", "importance_plots", "page")
+    imports = ", ".join(f"cconv.report.{name}" for name in modules)
+    code = f"import sys, {imports}; print({{'ray', 'torch'}} & set(sys.modules))"
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == "set()"

@@ -1,0 +1,172 @@
+"""Importance finds what decides the error in trials where that is known, and nothing where nothing does."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from cconv.errors import ConfigError, DataError
+from cconv.study.importance import importance_by_rung
+from cconv.study.partial_dependence import partial_dependence
+from cconv.study.records import TrialRecord
+from cconv.study.space import Choice, FloatRange, IntRange, SearchSpace
+from cconv.study.surrogate import axes_of, coordinates, cross_validated_r2, trials_at
+
+SPACE = SearchSpace(
+    name="test",
+    description="a test",
+    parameters={
+        "word": Choice(type="choice", values=["a", "b", "c"], baseline="a", reason="a test"),
+        "size": Choice(type="choice", values=[3, 4, 8], baseline=4, reason="a test"),
+        "rate": FloatRange(type="float", range=(1e-4, 1e-1), scale="log", baseline=1e-3, reason="a test"),
+        "count": IntRange(type="int", range=(1, 6), baseline=2, reason="a test"),
+        "only": Choice(type="choice", values=[1], baseline=1, reason="a test"),
+    },
+)
+
+
+def drawn(rng):
+    return {
+        "word": ["a", "b", "c"][rng.integers(3)],
+        "size": [3, 4, 8][rng.integers(3)],
+        "rate": float(10 ** rng.uniform(-4, -1)),
+        "count": int(rng.integers(1, 7)),
+        "only": 1,
+    }
+
+
+def record(number, parameters, errors, outcome="completed"):
+    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in errors.items()]
+    return TrialRecord(
+        id=f"r{number}", stage="random", parameters=parameters, config={}, log=log, outcome=outcome, reason=""
+    )
+
+
+def trials(count, log10_error, rungs=(10,)):
+    rng = np.random.default_rng(1)
+    configurations = [drawn(rng) for _ in range(count)]
+    return [
+        record(number, each, {updates: 10 ** log10_error(each, updates, rng) for updates in rungs})
+        for number, each in enumerate(configurations)
+    ]
+
+
+def by_word_and_rate(each, updates, rng):
+    """The word makes up two thirds of the variance, the logarithm of the rate a third."""
+    return -4 + 1.5 * (each["word"] == "b") + 0.6 * (math.log10(each["rate"]) + 2.5) + 0.05 * rng.normal()
+
+
+def test_shares_of_variance_are_those_of_an_additive_error():
+    entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], resamples=8)[0]
+    judged = entry["f_anova"]["parameters"]
+    word, rate = 1.5**2 * (1 / 3) * (2 / 3), 0.6**2 * 3**2 / 12
+    assert judged["word"]["importance"] == pytest.approx(word / (word + rate), abs=0.07)
+    assert judged["rate"]["importance"] == pytest.approx(rate / (word + rate), abs=0.07)
+    assert [name for name in judged if judged[name]["above_noise"]] == ["word", "rate"]
+    assert entry["surrogate_r2"] > 0.9
+    assert set(judged) == {"word", "size", "rate", "count"}
+    assert json.loads(json.dumps(entry)) == entry
+
+
+def test_what_the_best_have_in_common_is_important_by_ped_anova():
+    records = trials(200, lambda each, updates, rng: -3 - (each["size"] == 8) + 0.1 * rng.normal())
+    entry = importance_by_rung(records, SPACE, [10], resamples=5)
+    judged = entry[0]["ped_anova"]["parameters"]
+    assert judged["size"]["importance"] == max(each["importance"] for each in judged.values())
+    assert judged["size"]["above_noise"]
+    assert entry[0]["ped_anova"]["target_quantile"] == 0.1
+    assert sum(each["importance"] for each in judged.values()) == pytest.approx(1)
+
+
+def test_where_nothing_decides_nothing_is_above_noise():
+    entry = importance_by_rung(trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], resamples=20)[0]
+    assert entry["surrogate_r2"] < 0.1
+    assert not any(each["above_noise"] for each in entry["f_anova"]["parameters"].values())
+
+
+def test_rungs_are_never_mixed():
+    records = trials(
+        40, lambda each, updates, rng: -2 - (each["size"] == 8 if updates == 10 else each["word"] == "b"), (10, 30)
+    )
+    early, late = importance_by_rung(records, SPACE, [10, 30], resamples=4)
+    for entry, name in ((early, "size"), (late, "word")):
+        judged = entry["f_anova"]["parameters"]
+        assert judged[name]["importance"] > 0.9
+    assert importance_by_rung(records, SPACE, [20]) == []
+
+
+def test_a_rung_of_survivors_says_so_and_a_rung_of_few_is_left_out():
+    records = trials(40, by_word_and_rate, (10, 30, 90))
+    stopped = [record(100 + n, drawn(np.random.default_rng(n)), {10: 0.5}, "stopped") for n in range(20)]
+    few = [record(200 + n, each.parameters, {120: 0.5}) for n, each in enumerate(records[:9])]
+    entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], resamples=2)
+    assert [(entry["updates"], entry["trials"], entry["censored"]) for entry in entries] == [
+        (10, 60, False),
+        (30, 40, True),
+    ]
+
+
+def test_a_diverged_trial_counts_as_useless_at_the_rung_on_whose_way_it_diverged():
+    fine, wild = record(0, {}, {10: 0.1, 30: 0.01}), record(1, {}, {10: 50.0, 30: 0.1})
+    lost = record(2, {}, {10: 0.2, 17: None}, "diverged")
+    given_up = record(3, {}, {7: 99.0}, "stopped")
+    records = [fine, wild, lost, given_up]
+    assert trials_at(records, 10)[1].tolist() == pytest.approx([-1, 0, math.log10(0.2), 0])
+    reached, targets = trials_at(records, 30, after=10)
+    assert [each.id for each in reached] == ["r0", "r1", "r2"]
+    assert targets.tolist() == pytest.approx([-2, -1, 0])
+
+
+def test_every_axis_is_even_in_what_the_space_draws():
+    axes = axes_of(SPACE)
+    rng = np.random.default_rng(0)
+    points = coordinates(axes, [drawn(rng) for _ in range(2000)])
+    for axis, column in zip(axes, points.T, strict=True):
+        low, high = axis.bounds
+        assert column.min() >= low
+        assert column.max() <= high
+        assert np.mean(column) == pytest.approx((low + high) / 2, abs=0.05 * (high - low))
+        assert axis.encode(axis.decode(column[0])) == pytest.approx(column[0])
+
+
+def test_what_is_absent_is_at_its_baseline_and_what_is_outside_is_refused():
+    axes = axes_of(SPACE)
+    assert coordinates(axes, [{}]).tolist() == [[0, 1, -3, 2]]
+    with pytest.raises(DataError, match="`word` = 'd' is not in .*'a', 'b', 'c'.*give the space"):
+        coordinates(axes, [{"word": "d"}])
+    with pytest.raises(DataError, match="`count` = 7 is not in"):
+        coordinates(axes, [{"count": 7}])
+
+
+def test_a_surrogate_of_noise_does_not_predict():
+    rng = np.random.default_rng(0)
+    axes = axes_of(SPACE)
+    points = coordinates(axes, [drawn(rng) for _ in range(60)])
+    assert cross_validated_r2(axes, points, rng.normal(size=60), seed=0) < 0.1
+    assert cross_validated_r2(axes, points, points[:, 3], seed=0) > 0.95
+    assert cross_validated_r2(axes, points, np.ones(60), seed=0) is None
+
+
+def test_partial_dependence_follows_an_additive_error():
+    records = trials(150, by_word_and_rate)
+    found = partial_dependence(records, SPACE, 10, "word")
+    assert found["values"] == ["a", "b", "c"]
+    rise = np.log10(found["error"][1]) - np.log10(found["error"][0])
+    assert rise == pytest.approx(1.5, abs=0.15)
+    assert all(
+        low <= error <= high for low, error, high in zip(found["low"], found["error"], found["high"], strict=True)
+    )
+    assert len(found["points"]) == found["trials"] == 150
+    by_rate = partial_dependence(records, SPACE, 10, "rate")
+    slope = np.polyfit(np.log10(by_rate["values"]), np.log10(by_rate["error"]), 1)[0]
+    assert slope == pytest.approx(0.6, abs=0.1)
+    assert json.loads(json.dumps(by_rate)) == by_rate
+
+
+def test_partial_dependence_refuses_what_it_cannot_show():
+    records = trials(12, by_word_and_rate)
+    with pytest.raises(ConfigError, match="`only` does not vary in the space; those that do: word, size, rate, count"):
+        partial_dependence(records, SPACE, 10, "only")
+    with pytest.raises(ConfigError, match="0 trials have 11 updates"):
+        partial_dependence(records, SPACE, 11, "word")

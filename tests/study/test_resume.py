@@ -1,0 +1,93 @@
+"""A study whose whole process tree is killed goes on to the rungs of one that was not."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+from conftest import SCRIPT, SMOKE
+from outcomes import assert_one_clear_line
+
+from cconv.study.records import RunFolder
+
+STUDY = """
+name = "killed"
+task = "density_gradient"
+
+[network]
+layers = 2
+first_channels = 4
+hidden_channels = 8
+
+[training]
+updates = 36
+evaluate_every = 4
+
+[search]
+space = "{space}"
+grace_updates = 4
+concurrency = 1
+
+[stages.random]
+trials = 5
+
+[stages.adaptive]
+trials = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def study_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("studies") / "killed.toml"
+    path.write_text(STUDY.format(space=SMOKE.parents[1] / "search_spaces" / "smoke.toml"))
+    return path
+
+
+def evaluations(folder):
+    return sum(len(log.read_text().splitlines()) for log in folder.glob("trials/*/log.jsonl"))
+
+
+def kill_after(command, folder, count, timeout=150):
+    """Start a study in a process group of its own and kill all of it once so many evaluations are logged."""
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    deadline = time.monotonic() + timeout
+    while evaluations(folder) < count and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert process.poll() is None, "the study ended before it could be killed"
+    kill_tree(process.pid)
+    process.wait()
+
+
+def kill_tree(pid):
+    """SIGKILL a process and all that descend from it, also those that left its group."""
+    children = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()
+    os.kill(pid, signal.SIGSTOP)
+    for child in children:
+        kill_tree(int(child))
+    os.kill(pid, signal.SIGKILL)
+
+
+def without_times(log):
+    return [{key: value for key, value in entry.items() if key != "seconds"} for entry in log]
+
+
+@pytest.mark.timeout(400)
+def test_a_killed_study_resumes_to_the_same_rungs_and_logs(cconv, study_file, flow_folder, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    run = (SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out")
+    subprocess.run([*run, whole], check=True, capture_output=True, timeout=200)
+    kill_after([*run, killed], killed, 11)
+    before = {log.parent.name: len(log.read_text().splitlines()) for log in killed.glob("trials/*/log.jsonl")}
+    assert_one_clear_line(cconv(*run[1:], killed), "exists already")
+    finished = subprocess.run([SCRIPT, "study", "resume", killed], capture_output=True, text=True, timeout=200)
+    assert finished.returncode == 0, finished.stderr
+    assert json.loads((killed / "rungs.json").read_text()) == json.loads((whole / "rungs.json").read_text())
+    for ours, theirs in zip(RunFolder(killed).trials(), RunFolder(whole).trials(), strict=True):
+        assert (ours.id, ours.parameters, ours.outcome) == (theirs.id, theirs.parameters, theirs.outcome)
+        assert without_times(ours.log) == without_times(theirs.log)
+        assert len(ours.log) >= before.get(ours.id, 1) - 1
+    assert not list(killed.rglob("progress.safetensors"))

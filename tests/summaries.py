@@ -1,0 +1,161 @@
+"""Summaries with everything that a study may record, for tests of the report."""
+
+import copy
+
+import numpy as np
+
+
+def whole_summary(summary: dict) -> dict:
+    """A summary with all optional keys, made of one that has none of them."""
+    whole = copy.deepcopy(summary)
+    ids = [entry["id"] for entry in whole["finalists"]]
+    whole["search_points"] = _search_points()
+    whole["analytic"] = {"ms_per_frame": 2.2, "ms_low": 2.1, "ms_high": 2.35}
+    whole["front"] = {
+        "attainment": [
+            {"ms_per_frame": 1.5, "median": None, "low": None, "high": None},
+            {"ms_per_frame": 3.6, "median": 2.3e-3, "low": 2.0e-3, "high": 2.8e-3},
+            {"ms_per_frame": 4.2, "median": 9.5e-4, "low": 8.0e-4, "high": 1.2e-3},
+        ],
+        "hypervolume": {"value": 7.52, "low": 7.21, "high": 7.93, "reference": [10.0, 1.0]},
+    }
+    whole["growth"] = {
+        "sizes": [1000, 100_000],
+        "models": {name: [_size(1000), _size(100_000)] for name in ids},
+        "exponents": dict.fromkeys(ids, 1.03),
+    }
+    unmeasured = {"updates": 15, "trials": 2, "spearman": None, "recall": None, "regret": None, "verdict": "undecided"}
+    whole["rung_audit"] = [unmeasured, _rung(45, 0.6, "loses good trials"), _rung(135, 0.9, "keeps the best")]
+    whole["references"] = {
+        "strategies": {
+            "ASHA": {"updates": 4000, "best_valid": 9e-4, "curve": [[400, 0.01], [4000, 9e-4]]},
+            "a little, keep the best": {"updates": 3900, "best_valid": 1.2e-3, "curve": [[3900, 1.2e-3]]},
+        },
+        "asha_share": {"random": {"updates": 4000, "full_updates": 17857, "share": 0.224}},
+    }
+    whole["importance"] = [_importance(45), _importance(135)]
+    whole["ablation"] = {
+        "path": [
+            {"change": "baseline", "parameters": 9000, "valid_normalized_mse": 0.016, "low": 0.012, "high": 0.02},
+            {"change": "lost", "parameters": 90, "valid_normalized_mse": None, "low": None, "high": None},
+            {"change": "layers: 2", "parameters": 900, "valid_normalized_mse": 0.002, "low": 0.001, "high": 0.003},
+        ],
+        "branches": [
+            {"left_out": "dense", "normalized_mse": 0.004, "ms_per_frame": 3.9, "ratio": 4.21},
+            {"left_out": "boundary", "valid_normalized_mse": 0.002, "of": 0.001, "flops_per_particle": 900.0},
+            {"left_out": "density", "valid_normalized_mse": None, "of": 0.001, "flops_per_particle": None},
+        ],
+    }
+    whole["selection"] = {
+        "rule": "the cheapest within the margin",
+        "margin": 2e-4,
+        "best": ids[0],
+        "by_rule": {"one_standard_error": ids[0], "accurate_enough": None},
+        "comparisons": [_comparison(name, number) for number, name in enumerate(ids)],
+    }
+    whole["refined"] = {"layers": "narrowed to 1 and 2: no better trial has more"}
+    for entry in whole["finalists"]:
+        entry["stability"] = stability(entry["test"]["normalized_mse"])
+    return whole
+
+
+def stability(error: float) -> dict:
+    """Stability of a model that has this error everywhere."""
+    failures = [] if error <= 0.05 else [f"error {error:.3g} on the frame clumped (limit 0.05)"]
+    return {
+        "regimes": {
+            "bulk": {"normalized_mse": error, "share": 0.9},
+            "near_wall": {"normalized_mse": error, "share": 0.1},
+        },
+        "stress": {"clumped": error, "isolated": None},
+        "precision": 1e-6,
+        "density_rollout": {"frames": 60, "drift": 1e-3, "largest": 1e-3, "first_frame_outside": None},
+        "stable": not failures,
+        "failures": failures,
+        "thresholds": {"stressed_error": 0.05, "regime_error": 0.5, "precision": 1e-3, "density": 0.02},
+    }
+
+
+def explanation(dim: int = 2, components: int = 1, particles: int = 60) -> dict[str, np.ndarray]:
+    """Arrays as `cconv.evaluation.explanation` gives them, of an imaginary model."""
+    rng = np.random.default_rng(0)
+    line, radii = np.linspace(-0.2, 0.2, 21), np.linspace(0.01, 0.2, 10)
+    filters = rng.normal(size=(dim, 21, dim + 2, components))
+    return {
+        "task": np.array("density_gradient" if components > 1 else "density_rate"),
+        "particle_spacing": np.array(0.1),
+        "positions": rng.uniform(size=(particles, dim)),
+        "target": rng.normal(size=(particles, components)),
+        "prediction": rng.normal(size=(particles, components)),
+        "error": rng.uniform(size=particles),
+        "feature_names": np.array(["1", *(f"v_{axis}" for axis in "xyz"[:dim]), "ρ"]),
+        "is_combined": np.array(False),
+        "unexplained": np.array(0.0123),
+        "cutoff": np.array(0.2),
+        "support": np.array(0.2),
+        "line": line,
+        "learned_on_axes": filters,
+        "analytic_on_axes": filters + 0.1,
+        "radii": radii,
+        "learned_radial": -radii,
+        "learned_radial_low": -radii - 0.1,
+        "learned_radial_high": -radii + 0.1,
+        "analytic_radial": -radii,
+        "error_bins": np.logspace(-8, 3, 56),
+        "error_counts": np.bincount(rng.integers(10, 40, particles), minlength=55),
+        "error_levels": np.array([0.5, 1.0]),
+        "error_quantiles": np.array([0.01, 0.1]),
+    }
+
+
+def _search_points() -> list[dict]:
+    outcomes = ("completed", "stopped", "diverged")
+    points = [
+        {
+            "id": f"{stage}_{number:04d}",
+            "stage": stage,
+            "valid_normalized_mse": 10.0 ** (number - 3),
+            "ms_per_frame": 2.0 + number,
+            "measured": stage == "closed_form",
+            "num_parameters": 100 * number + 7,
+            "outcome": "completed" if stage == "closed_form" else outcomes[number % 3],
+            "parameters": {"layers": 2, "window": "poly6", "learning_rate": 0.0012345},
+        }
+        for stage in ("closed_form", "random", "second look")
+        for number in range(5)
+    ]
+    return [*points, points[-1] | {"id": "lost", "outcome": "diverged", "valid_normalized_mse": None}]
+
+
+def _size(num_particles: int) -> dict:
+    ms = num_particles / 1000
+    parts = {"geometry_ms": 0.6 * ms, "network_ms": 0.4 * ms}
+    return {"num_particles": num_particles, "ms_per_frame": ms, "ms_low": 0.9 * ms, "ms_high": 1.1 * ms} | parts
+
+
+def _rung(updates: int, value: float, verdict: str) -> dict:
+    measures = ("spearman", "recall", "regret")
+    interval = {"value": value, "low": value - 0.1, "high": value + 0.1}
+    return {"updates": updates, "trials": 16, "verdict": verdict} | dict.fromkeys(measures, interval)
+
+
+def _importance(updates: int) -> dict:
+    judged = {"importance": 0.4, "low": 0.3, "high": 0.5, "above_noise": True}
+    found = {"noise_floor": 0.1, "parameters": {"layers": judged, "window": judged | {"above_noise": False}}}
+    facts = {"updates": updates, "trials": 16, "censored": True, "clipped": 0, "surrogate_r2": 0.7}
+    return facts | {"f_anova": found, "ped_anova": found}
+
+
+def _comparison(name: str, number: int) -> dict:
+    worse = number > 0
+    return {
+        "id": name,
+        "difference": 1e-3 * number,
+        "ci95": [8e-4 * number, 1.2e-3 * number],
+        "standard_error": 1e-4 * number,
+        "within_one_se": not worse,
+        "non_inferior": not worse,
+        "accurate_enough": None,
+        "stable": True,
+        "why_not": "less accurate than the margin allows" if worse else "",
+    }

@@ -1,0 +1,59 @@
+"""A training that was left goes on as if it had not been."""
+
+import pytest
+import torch
+from systems import problem
+
+from cconv.errors import DataError
+from cconv.training.field_model import NetworkConfig
+from cconv.training.loop import train
+from cconv.training.progress import begin, load_progress, save_progress
+
+NETWORKS = [NetworkConfig(layers=2, kernel_size=3), NetworkConfig(layers=2, basis="radial", radial_terms=4)]
+OPTIONS = {"updates": 12, "evaluate_every": 3, "learning_rate": 0.01, "batch_size": 2}
+
+
+@pytest.fixture
+def one_thread():
+    """As trials train: sums over several threads round differently from run to run."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: network.basis)
+@pytest.mark.parametrize("left_at", [1, 6, 11])
+def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, network, left_at):
+    given = problem(generator)
+    whole = given.build_model(network, 0)
+    losses = [state.train_loss for state in train(whole, given.train_samples, given.valid_samples, **OPTIONS)]
+    first = given.build_model(network, 0)
+    progress = begin(first)
+    states = train(first, given.train_samples, given.valid_samples, **OPTIONS, progress=progress)
+    for state in states:
+        if state.updates == left_at:
+            break
+    save_progress(tmp_path / "progress", first, progress)
+    second = given.build_model(network, 1)
+    restored = load_progress(tmp_path / "progress", second)
+    rest = list(train(second, given.train_samples, given.valid_samples, **OPTIONS, progress=restored))
+    assert [state.train_loss for state in rest] == losses[left_at:]
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(second.parameters(), whole.parameters(), strict=True))
+    assert rest[-1].seconds > state.seconds
+
+
+def test_a_damaged_file_is_named(generator, tmp_path):
+    (tmp_path / "progress").write_bytes(b"nothing")
+    with pytest.raises(DataError, match="delete it to begin again"):
+        load_progress(tmp_path / "progress", problem(generator).build_model(NETWORKS[0], 0))
+
+
+def test_the_progress_of_another_network_is_refused(generator, tmp_path):
+    given = problem(generator)
+    model = given.build_model(NETWORKS[0], 0)
+    save_progress(tmp_path / "progress", model, begin(model))
+    with pytest.raises(DataError, match="no progress of this training"):
+        load_progress(tmp_path / "progress", given.build_model(NETWORKS[1], 0))
+    assert [path.name for path in tmp_path.iterdir()] == ["progress"]
