@@ -59,6 +59,11 @@ class FluidState:
     densities: Tensor
     edges: Edges
 
+    def single(self) -> "FluidState":
+        """The same in float32, as networks compute."""
+        values = {name: value.float() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **values, edges=self.edges.to(torch.float32))
+
 
 def fluid_state(frame: Frame, box: Box, kernel) -> FluidState:
     """Fluid particles of `frame` with density by summation over fluid particles only, as in the thesis."""

@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
-from cconv.data.features import Inputs
+from cconv.data.features import FluidState, Inputs
 from cconv.data.targets import VECTOR_TASKS
 from cconv.domain import Box
 from cconv.evaluation.cost_model import Surroundings, estimate
@@ -88,6 +88,34 @@ def measure_costs(
             num_particles=particles,
         )
     return costs
+
+
+def measure_analytic(
+    states: Sequence[FluidState], box: Box, field: Callable, kernel, *, threads: int, repeats: int
+) -> dict[str, float]:
+    """Time of the analytic field itself, neighbour search within the kernel's support included, densities given.
+
+    Args:
+        states: Fluid of the frames to compute it on, in turn, in the precision of the networks.
+        box: Their box.
+        field: State and kernel to the field (N, C).
+        kernel: SPH kernel.
+        threads: Torch threads.
+        repeats: Timed frames.
+
+    Returns:
+        "ms_per_frame", "ms_low", "ms_high", "geometry_ms" (neighbours) and "network_ms" (the field).
+    """
+    times = []
+    with _threads(threads):
+        for repeat in range(repeats + 1):
+            state = states[repeat % len(states)]
+            start = time.perf_counter()
+            state = replace(state, edges=radius_graph(state.positions, kernel.support_radius, box))
+            middle = time.perf_counter()
+            field(state, kernel)
+            times.append((middle - start, time.perf_counter() - middle))
+    return _medians(times[1:])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,15 +4,18 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from itertools import islice
 
 import numpy as np
 
+from cconv.data.features import fluid_state
 from cconv.data.splits import evenly_spaced
-from cconv.data.targets import Sample
+from cconv.data.targets import TASKS, Sample
 from cconv.errors import ConfigError
-from cconv.evaluation.cost import Cost, measure_costs, measure_growth
+from cconv.evaluation.cost import Cost, measure_analytic, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.evaluation.stability import measure_stability
+from cconv.sph.kernels import kernel_named
 from cconv.study.costs import points_of_search
 from cconv.study.finalists import Retrained, complete_cards, evaluate_finalist, finalist_entry, retrained_finalists
 from cconv.study.front import attainment, bootstrap_hypervolume
@@ -70,6 +73,7 @@ def select(session: Session, stage: str) -> dict:
         "recommended": {"id": chosen.id, "reason": chosen.reason},
         "selection": _selection(chosen, study.selection.margin),
         **points_of_search(session.count_cost, run.trials(), timed),
+        "analytic": _analytic(session),
         "growth": _growth(session, finalists),
         "trials": _counts(run),
         **_of_earlier_stages(session, stage),
@@ -103,6 +107,18 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> dict[str, Cost]:
     chosen = [trials[place] for place in evenly_spaced(len(trials), settings.trials)] if trials else []
     checkpoints |= {record.id: run.trial(record.id).checkpoint for record in chosen}
     return measure_costs(checkpoints, load_model, inputs, threads=settings.threads, repeats=settings.repeats)
+
+
+def _analytic(session: Session) -> dict:
+    """Time of the analytic field on the frames that the finalists are timed on."""
+    study, problem, scene = session.study, session.problem, session.dataset.scene
+    kernel = kernel_named(problem.kernel)(problem.smoothing_length, scene.dim)
+    frames = islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES)
+    states = [fluid_state(frame, scene.box, kernel).single() for frame in frames]
+    settings = study.cost
+    return measure_analytic(
+        states, scene.box, TASKS[study.task], kernel, threads=settings.threads, repeats=settings.repeats
+    )
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:

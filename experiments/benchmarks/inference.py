@@ -33,6 +33,7 @@ from cconv.training.checkpoint import load_model, save_model
 from cconv.training.field_model import FieldModel, NetworkConfig, build_field_model
 
 SPACING = 0.05
+DIM = 3
 LAYER = {"layers": 1, "basis": "radial", "message": "difference", "relative_cutoff": 2.0, "window": "none"}
 COMPARED = {
     "published network": {},
@@ -60,7 +61,7 @@ SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
 def frame_of(folder: Path) -> tuple[Scene, Sample]:
     dataset = open_dataset(folder, mass=0.125, particle_spacing=SPACING, frame_dt=1 / 60)
     frame = dataset.trajectory("train", 0)[20]
-    return dataset.scene, make_sample(frame, dataset.scene, "density_rate", CubicSpline(SPACING, 3))
+    return dataset.scene, make_sample(frame, dataset.scene, "density_rate", CubicSpline(SPACING, DIM))
 
 
 def model_of(settings: Mapping, scene: Scene, sample: Sample) -> FieldModel:
@@ -190,7 +191,11 @@ def measure_checks(data: Path, rounds: int) -> dict:
         costs = measure_costs(saved, load_model, [sample.inputs], threads=1, repeats=max(2, rounds // 2))
     counted = {
         name: estimate(
-            NetworkConfig(**settings).model_dump(), dim=3, vector_output=False, boundary_channels=3, surroundings=around
+            NetworkConfig(**settings).model_dump(),
+            dim=DIM,
+            vector_output=False,
+            boundary_channels=DIM,
+            surroundings=around,
         )
         for name, settings in CHECKED.items()
     }
@@ -226,7 +231,7 @@ def draw_models(panel: plt.Axes, compared: dict) -> None:
             )
     panel.set_yticks([place + 0.2 for place in range(len(COMPARED))], list(COMPARED))
     panel.invert_yaxis()
-    panel.margins(x=0.25)
+    panel.margins(x=0.4)
     panel.set(xlabel="ms per frame", title="search and geometry (blue), network (orange)")
 
 
