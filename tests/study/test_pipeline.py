@@ -5,7 +5,7 @@ import subprocess
 
 import optuna
 import pytest
-from conftest import SCRIPT, SMOKE
+from conftest import SCRIPT
 
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
