@@ -78,7 +78,7 @@ class ConvGeometry:
         normalize: bool = False,
         detach_positions: bool = False,
     ):
-        check_edges(edges)
+        edges.check()
         self.kernel_size = grid_shape(kernel_size, edges.dim)
         self.normalize = normalize
         self.bipartite, self.includes_self = edges.bipartite, edges.includes_self
@@ -132,31 +132,6 @@ def _filter_reads(
         num_cells=math.prod(sizes),
         num_senders=edges.num_senders,
     )
-
-
-def check_edges(edges: Edges) -> None:
-    """Require edges that compiled loops can follow.
-
-    Raises:
-        ShapeError: If pairs, row splits and numbers of points do not fit, or a displacement is not finite.
-    """
-    if not torch.isfinite(edges.displacements).all():
-        raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
-    lengths = {len(edges.senders), len(edges.receivers), len(edges.displacements), int(edges.row_splits[-1])}
-    fits = len(lengths) == 1 and int(edges.row_splits[0]) == 0 and not (edges.row_splits.diff() < 0).any()
-    if (
-        not fits
-        or not _all_below(edges.senders, edges.num_senders)
-        or not _all_below(edges.receivers, edges.num_receivers)
-    ):
-        raise ShapeError(
-            f"`edges` must list pairs among {edges.num_receivers} receivers and {edges.num_senders} senders, got row "
-            "splits or indices beyond that; build them with `radius_graph`."
-        )
-
-
-def _all_below(indices: Tensor, count: int) -> bool:
-    return len(indices) == 0 or 0 <= int(indices.min()) <= int(indices.max()) < count
 
 
 def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cconv.errors import ConfigError
 from cconv.sph.kernels import KERNELS
-from cconv.study.rungs import rungs_up_to
+from cconv.study.asha import rungs_up_to
 from cconv.study.stages import Stage, check_order, default_stages
 from cconv.training.field_model import NetworkConfig
 from cconv.validation import StrictModel, validated

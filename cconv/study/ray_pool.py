@@ -1,9 +1,9 @@
 """Trainings side by side with Ray Tune, on this machine or on a cluster."""
 
 import errno
-import faulthandler
 import os
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +21,7 @@ os.environ.update(
     TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S="0",
     TUNE_GLOBAL_CHECKPOINT_S="1000000",  # Ray's own state is never restored
     TUNE_WARN_THRESHOLD_S="60",
+    RAY_NUM_REDIS_GET_RETRIES="1",  # of joining a cluster; each takes 40 seconds
 )
 
 import ray  # noqa: E402, its settings are read at import
@@ -29,13 +30,17 @@ from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
 from cconv.errors import ConfigError  # noqa: E402
+from cconv.study.attempt import Attempt  # noqa: E402
 from cconv.study.config import StudyConfig, TrainingConfig  # noqa: E402
 from cconv.study.problem import Problem, provenance  # noqa: E402
 from cconv.study.records import TrialFolder  # noqa: E402
 from cconv.study.trial import run_trial  # noqa: E402
 from cconv.study.trial_queue import Job, TrialQueue  # noqa: E402
+from cconv.training.loop import TrainingState  # noqa: E402
 
+QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # what fails is in our records
 OBJECT_STORE_BYTES = 2**30
+CONNECTION_SECONDS = 5.0
 RESTARTS = 2  # of a training whose process or node died; it goes on from its last evaluation
 HANGING = 2.0  # times its limit after which a training's process is ended from outside
 DISK_FULL = "disk full"
@@ -46,22 +51,33 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
     """A private Ray on this machine with a core a training, or the cluster at `address`; its files go when it ends.
 
     Raises:
-        ConfigError: If there is no cluster at the address.
+        ConfigError: If there is no cluster at the address that can be joined.
     """
     folder = folder.absolute()
-    settings = {"log_to_driver": False, "logging_level": "ERROR"}
     try:
         if address is None:
             own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
-            ray.init(num_cpus=study.concurrency, **own, **settings)
+            ray.init(num_cpus=study.concurrency, **own, **QUIET)
         else:
-            ray.init(address=address, **settings)
+            _join(address)
         yield RayPool(study, problem, folder)
-    except ConnectionError as error:
-        raise ConfigError(f"--address {address}: no Ray cluster there; start one with `ray start --head`.") from error
     finally:
         ray.shutdown()
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _join(address: str) -> None:
+    host, _, port = address.rpartition(":")
+    try:
+        if port.isdigit():  # Ray itself would try for minutes
+            socket.create_connection((host, int(port)), CONNECTION_SECONDS).close()
+        ray.init(address=address, **QUIET)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"--address {address}: no Ray cluster there that this machine can join ({reason}); start one with "
+            "`ray start --head`, on every machine from the same environment, and run this on one of them."
+        ) from error
 
 
 class RayPool:
@@ -80,7 +96,12 @@ class RayPool:
     @property
     def concurrency(self) -> int:
         """Trainings at once: as many as the pool has cores, unless the study says otherwise."""
-        return self._study.search.concurrency or max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        return self._study.search.concurrency or sum(_cores_by_node())
+
+    @property
+    def concurrency_of_a_node(self) -> int:
+        """Trainings at once that share the memory of a node."""
+        return min(self.concurrency, max(_cores_by_node()))
 
     def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
         """Train every job of a queue that does not stop earlier to the full budget of `training`.
@@ -88,7 +109,7 @@ class RayPool:
         Raises:
             ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
         """
-        shared, cache = self._shared, training.cache_megabytes // self.concurrency
+        shared, cache = self._shared, training.cache_megabytes // self.concurrency_of_a_node
         training = training.model_copy(update={"cache_megabytes": cache})
 
         def trainable(config: dict) -> None:
@@ -121,6 +142,10 @@ class RayPool:
             raise driver.error or error from None
         if driver.error:
             raise driver.error
+
+
+def _cores_by_node() -> list[int]:
+    return [max(int(node["Resources"].get("CPU", 1)), 1) for node in ray.nodes() if node["Alive"]]
 
 
 class _NeverRestored:
@@ -181,7 +206,8 @@ class _Driver(_NeverRestored, tune.Callback):
 
     def on_trial_error(self, iteration, trials, trial, **info) -> None:
         """The training's process or node died too often."""
-        self._end(trial, "failed", "its process died")
+        cause = type(trial.get_pickled_error()).__name__
+        self._end(trial, "failed", f"its process or node died {RESTARTS + 1} times ({cause})")
 
     def _end(self, trial, outcome: str, reason: str) -> None:
         try:
@@ -203,34 +229,48 @@ def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: Stu
     """Train a job; every evaluation is reported, then how it ended if the training itself knows."""
     torch.set_num_threads(1)
     limit = study.search.trial_seconds
-    faulthandler.dump_traceback_later(HANGING * limit, exit=True)
     last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
     outcome, reason = None, ""
     try:
-        trial = run_trial(
-            problem,
-            job.parameters,
-            study.network,
-            training,
-            TrialFolder(job.folder),
-            stage=stage,
-            init_seed=job.init_seed,
-            data_seed=study.seeds.data,
-            provenance=provenance(study),
-            seconds_limit=limit,
-        )
-        for last in trial:
-            tune.report(last | {"outcome": None, "reason": ""})
+        with Attempt(job.folder, HANGING * limit) as attempt:
+            for last in _trial(job, stage, training, study, problem, attempt):
+                tune.report(last | {"outcome": None, "reason": ""})
         if not last["diverged"] and last["updates"] < training.updates:
             outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
     except Exception as error:
-        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        outcome, reason = DISK_FULL if full else "failed", str(error) or type(error).__name__
-    finally:
-        faulthandler.cancel_dump_traceback_later()
+        outcome, reason = DISK_FULL if _is_disk_full(error) else "failed", str(error) or type(error).__name__
     if outcome is not None:
         _record_what_failed(job, stage, outcome)
         tune.report(last | {"outcome": outcome, "reason": reason})
+
+
+def _trial(
+    job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem, attempt: Attempt
+) -> Iterator[dict]:
+    def check_before_writing(state: TrainingState) -> None:
+        if state.valid_normalized_mse is not None or state.diverged:
+            attempt.check()
+
+    folder = TrialFolder(job.folder)
+    yield from folder.log()[-1:]  # an earlier attempt may have died before it was judged
+    yield from run_trial(
+        problem,
+        job.parameters,
+        study.network,
+        training,
+        folder,
+        stage=stage,
+        init_seed=job.init_seed,
+        data_seed=study.seeds.data,
+        provenance=provenance(study),
+        seconds_limit=study.search.trial_seconds,
+        on_update=check_before_writing,
+    )
+
+
+def _is_disk_full(error: Exception) -> bool:
+    """By its words, as not every library that writes raises an OSError."""
+    return any(os.strerror(code) in str(error) for code in (errno.ENOSPC, errno.EDQUOT))
 
 
 def _record_what_failed(job: Job, stage: str, outcome: str) -> None:

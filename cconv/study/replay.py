@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cconv.study.asha import RungTable
 from cconv.study.records import TrialRecord
-from cconv.study.rungs import RungTable
 
 Curve = Sequence[tuple[int, float]]
 

@@ -7,10 +7,10 @@ goes on as it would have, and one that finished takes more trials.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from cconv.study.asha import RungFile
 from cconv.study.config import TrainingConfig
 from cconv.study.records import RunFolder, TrialFolder, TrialRecord, read_json
 from cconv.study.replay import best_so_far, spent_updates
-from cconv.study.rungs import RungFile
 from cconv.study.sampling import random_parameters, suggest_parameters
 from cconv.study.session import Session
 from cconv.study.trial_queue import Job, NothingStops, StopsByRungs, TrialQueue

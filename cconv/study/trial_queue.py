@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from cconv.study.asha import RungFile, RungTable
 from cconv.study.observer import Observer
 from cconv.study.records import TrialFolder
-from cconv.study.rungs import RungFile, RungTable
 
 
 @dataclass(frozen=True, kw_only=True)

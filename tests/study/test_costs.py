@@ -44,9 +44,7 @@ def test_times_that_follow_from_the_count_are_found_again(generator):
     """Every second trial was measured; the times of the others come from the cost model."""
     count = CostCounter(STUDY, problem(generator))
     records = [record(number, parameters) for number, parameters in enumerate(PARAMETERS)]
-    truth = [
-        1.0 + 1e-3 * count(each).flops_per_particle + 1e-4 * count(each).bytes_per_particle for each in PARAMETERS
-    ]
+    truth = [1.0 + 1e-3 * count(each).flops_per_particle + 1e-4 * count(each).bytes_per_particle for each in PARAMETERS]
     measured = {each.id: cost(time) for each, time in list(zip(records, truth, strict=True))[::2]}
     found = points_of_search(count, records, measured)
     points = found["search_points"]

@@ -100,9 +100,9 @@ def test_a_corrupt_line_is_named_with_its_number(tmp_path):
 
 
 def test_a_folder_is_held_by_one_run_at_a_time(tmp_path):
-    with RunFolder(tmp_path).locked():
-        with pytest.raises(ConfigError, match="another run works in this folder"), RunFolder(tmp_path).locked():
-            pass
+    refused = pytest.raises(ConfigError, match="another run works in this folder")
+    with RunFolder(tmp_path).locked(), refused, RunFolder(tmp_path).locked():
+        pass
     with RunFolder(tmp_path).locked():
         pass
 

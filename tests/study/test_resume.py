@@ -51,9 +51,7 @@ def evaluations(folder):
 
 def kill_after(command, folder, count, timeout=150):
     """Start a study in a process group of its own and kill all of it once so many evaluations are logged."""
-    process = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     deadline = time.monotonic() + timeout
     while evaluations(folder) < count and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)

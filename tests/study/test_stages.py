@@ -4,7 +4,7 @@ import pytest
 
 from cconv.errors import ConfigError
 from cconv.study.config import StudyConfig
-from cconv.study.stages import default_stages, reads_of, readers_of
+from cconv.study.stages import default_stages, readers_of, reads_of
 from cconv.validation import validated
 
 SEARCH = {"space": "space.toml"}

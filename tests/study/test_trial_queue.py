@@ -1,9 +1,9 @@
-"""The queue hands out trainings, judges them and ends them; a queue over records of a killed run goes on as it would."""
+"""The queue hands out trainings, judges and ends them; over the records of a killed run it goes on as it would."""
 
 import pytest
 
+from cconv.study.asha import RungFile, rungs_up_to
 from cconv.study.records import RunFolder
-from cconv.study.rungs import RungFile, rungs_up_to
 from cconv.study.trial_queue import Job, NothingStops, StopsByRungs, TrialQueue
 
 FULL = 27

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from ray.tune.schedulers import ASHAScheduler
 
-from cconv.study.rungs import RungFile, RungTable, rungs_up_to
+from cconv.study.asha import RungFile, RungTable, rungs_up_to
 
 
 def curves(seed, count=60, full=27):
