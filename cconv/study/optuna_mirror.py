@@ -5,18 +5,23 @@ is PRUNED with its errors at each evaluation, so that errors of different budget
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import optuna
+from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState, create_trial
+from sqlalchemy.exc import SQLAlchemyError
 
 from cconv.errors import ConfigError
 from cconv.study.records import DIVERGED_ERROR
 from cconv.study.sampling import distributions_of
 from cconv.study.space import SearchSpace
+
+CONNECTION_SECONDS = 10
 
 
 def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
@@ -28,13 +33,31 @@ def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     if url is None:
         return JournalStorage(JournalFileBackend(str(journal)))
+    waits = {"connect_timeout": CONNECTION_SECONDS} if url.startswith("postgresql") else {}
     try:
-        return RDBStorage(url)
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True, "connect_args": waits})
     except Exception as error:  # of SQLAlchemy, of the driver, or of the import of the driver
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"--storage {_without_password(url)}: no database there that Optuna can use ({reason}); "
             "start it, or leave --storage out for a journal file in the run folder."
+        ) from error
+
+
+@contextmanager
+def database_answers(url: str | None) -> Iterator[None]:
+    """Say in one line that the database at `url` went away.
+
+    Raises:
+        ConfigError: If Optuna says so inside.
+    """
+    try:
+        yield
+    except (StorageInternalError, SQLAlchemyError) as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ConfigError(
+            f"--storage {_without_password(url or 'optuna.journal')}: the database no longer answers ({reason}); "
+            "start it, then `cconv study resume` with the same --storage."
         ) from error
 
 

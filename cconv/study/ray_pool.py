@@ -124,8 +124,8 @@ class RayPool:
                 reuse_actors=True,
                 trial_name_creator=lambda trial: trial.config["job"].name,
                 trial_dirname_creator=lambda trial: trial.trial_id,
-                search_alg=_Jobs(queue),
-                scheduler=_Judge(queue),
+                search_alg=_Jobs(driver),
+                scheduler=_Judge(driver),
             ),
             run_config=tune.RunConfig(
                 name=stage,
@@ -155,16 +155,61 @@ class _NeverRestored:
         return {}
 
 
+class _Driver(_NeverRestored, tune.Callback):
+    """Passes on what Ray and the queue have to say to each other, until an error of the queue ends the run.
+
+    Ray keeps no more of such an error than its text, and may speak of further trials while it gives up.
+    """
+
+    def __init__(self, queue: TrialQueue):
+        self._queue = queue
+        self.error: Exception | None = None
+
+    @contextmanager
+    def _ends_the_run(self) -> Iterator[TrialQueue]:
+        if self.error is not None:
+            raise self.error
+        try:
+            yield self._queue
+        except Exception as error:
+            self.error = error
+            raise
+
+    def next(self) -> Job | None:
+        """The next job."""
+        with self._ends_the_run() as queue:
+            return queue.next()
+
+    def goes_on(self, trial, result: dict) -> bool:
+        """Whether a trial goes on after an evaluation; a last word of the training is none."""
+        with self._ends_the_run() as queue:
+            return result["outcome"] is not None or queue.on_result(str(trial), result)
+
+    def on_trial_complete(self, iteration, trials, trial, **info) -> None:
+        """A training said how it ended, or was stopped after its last evaluation."""
+        last = trial.last_result
+        with self._ends_the_run() as queue:
+            if last["outcome"] == DISK_FULL:
+                job = trial.config["job"]
+                raise ConfigError(f"{job.folder}: {last['reason']}; make room, then `cconv study resume`.")
+            queue.on_end(str(trial), last["outcome"] or queue.outcome_after(last), last["reason"])
+
+    def on_trial_error(self, iteration, trials, trial, **info) -> None:
+        """The training's process or node died too often."""
+        with self._ends_the_run() as queue:
+            queue.on_end(str(trial), "failed", f"its process or node died {RESTARTS + 1} times")
+
+
 class _Jobs(_NeverRestored, Searcher):
     """Hands the jobs of a queue to Ray."""
 
-    def __init__(self, queue: TrialQueue):
+    def __init__(self, driver: _Driver):
         super().__init__()
-        self._queue = queue
+        self._driver = driver
 
     def suggest(self, trial_id: str) -> dict | str:
         """The next job, when a place is free."""
-        job = self._queue.next()
+        job = self._driver.next()
         return Searcher.FINISHED if job is None else {"job": job}
 
     def on_trial_complete(self, trial_id: str, result: dict | None = None, error: bool = False) -> None:
@@ -177,44 +222,13 @@ class _Jobs(_NeverRestored, Searcher):
 class _Judge(_NeverRestored, FIFOScheduler):
     """Stops a trial when the queue says so."""
 
-    def __init__(self, queue: TrialQueue):
+    def __init__(self, driver: _Driver):
         super().__init__()
-        self._queue = queue
+        self._driver = driver
 
     def on_trial_result(self, tune_controller, trial, result: dict) -> str:
-        """Ask the queue after an evaluation; a last word of the training is none."""
-        goes_on = result["outcome"] is not None or self._queue.on_result(str(trial), result)
-        return TrialScheduler.CONTINUE if goes_on else TrialScheduler.STOP
-
-
-class _Driver(_NeverRestored, tune.Callback):
-    """Tells the queue how trainings end."""
-
-    def __init__(self, queue: TrialQueue):
-        self._queue = queue
-        self.error: Exception | None = None
-
-    def on_trial_complete(self, iteration, trials, trial, **info) -> None:
-        """A training said how it ended, or was stopped after its last evaluation."""
-        last = trial.last_result
-        if last["outcome"] == DISK_FULL:
-            self.error = ConfigError(
-                f"{trial.config['job'].folder}: {last['reason']}; make room, then `cconv study resume`."
-            )
-            raise self.error
-        self._end(trial, last["outcome"] or self._queue.outcome_after(last), last["reason"])
-
-    def on_trial_error(self, iteration, trials, trial, **info) -> None:
-        """The training's process or node died too often."""
-        cause = type(trial.get_pickled_error()).__name__
-        self._end(trial, "failed", f"its process or node died {RESTARTS + 1} times ({cause})")
-
-    def _end(self, trial, outcome: str, reason: str) -> None:
-        try:
-            self._queue.on_end(str(trial), outcome, reason)
-        except OSError as error:
-            self.error = error
-            raise
+        """Ask the queue."""
+        return TrialScheduler.CONTINUE if self._driver.goes_on(trial, result) else TrialScheduler.STOP
 
 
 class _Silent(tune.ProgressReporter):

@@ -1,10 +1,13 @@
 import math
 
 import pytest
-from systems import problem
+import torch
+from systems import kernel, periodic_frame, periodic_scene, problem
 
+from cconv.data.features import fluid_state
+from cconv.data.targets import TASKS, make_sample
 from cconv.evaluation import cost as costs
-from cconv.evaluation.cost import flops_per_particle, fluid_block, measure_costs, measure_growth
+from cconv.evaluation.cost import flops_per_particle, fluid_block, measure_analytic, measure_costs, measure_growth
 from cconv.neighbors import radius_graph
 from cconv.training.checkpoint import load_model, save_model
 from cconv.training.field_model import FieldConfig, NetworkConfig
@@ -41,6 +44,22 @@ def test_measured_costs_are_consistent(generator, tmp_path):
     assert cost.us_per_particle == pytest.approx(1e3 * cost.ms_per_frame / 64)
     assert 0 < cost.peak_mb < 1000
     assert (cost.threads, cost.num_particles) == (1, 64)
+
+
+def test_the_analytic_field_is_timed_on_the_states_and_left_as_it_is(generator):
+    """The field that is timed is the target of the samples, in float32."""
+    scene = periodic_scene()
+    spline, state = kernel(scene), fluid_state(periodic_frame(generator), scene.box, kernel(scene)).single()
+    seen = []
+
+    def field_of(state, kernel):
+        seen.append(TASKS["density_rate"](state, kernel))
+
+    times = measure_analytic([state], scene.box, field_of, spline, threads=1, repeats=3)
+    assert 0 < times["ms_low"] <= times["ms_per_frame"] <= times["ms_high"]
+    exact = make_sample(periodic_frame(torch.Generator().manual_seed(0)), scene, "density_rate", spline).target
+    assert all(torch.allclose(field, exact, atol=1e-5 * exact.abs().max()) for field in seen)
+    assert len(seen) == 4
 
 
 def field(dim, boundary_channels, spacing=0.1):
