@@ -100,13 +100,14 @@ class SearchSpace(StrictModel):
     """A named set of hyperparameters and their domains.
 
     A parameter is active where every condition of its `when` holds: the named parameter is active and has one of the
-    listed values. A configuration is an assignment of the active parameters only. No trial may cost more than
-    `max_flops_per_particle`, multiplications and additions of one particle's prediction.
+    listed values. A configuration is an assignment of the active parameters only. No trial's prediction may take more
+    than `max_flops_per_particle` multiplications and additions a particle, or move more than `max_bytes_per_particle`.
     """
 
     name: str
     description: str
     max_flops_per_particle: float | None = Field(None, gt=0)
+    max_bytes_per_particle: float | None = Field(None, gt=0)
     parameters: dict[str, Parameter] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -133,6 +134,15 @@ class SearchSpace(StrictModel):
             return f"must be on a choice or a whole number, and {parent!r} is a real number"
         outside = [value for value in values if not domain.holds(value)]
         return f"lists {outside[0]!r}, which is not in the domain of {parent!r}" if outside else ""
+
+    @property
+    def caps(self) -> dict[str, float]:
+        """Caps on cost that the space has, by the name of what they cap."""
+        caps = {
+            "flops_per_particle": self.max_flops_per_particle,
+            "bytes_per_particle": self.max_bytes_per_particle,
+        }
+        return {name: cap for name, cap in caps.items() if cap is not None}
 
     @property
     def parents_first(self) -> list[str]:

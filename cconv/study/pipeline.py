@@ -159,7 +159,7 @@ def _session(
     if not dataset.scene.has_boundary:
         space = fixed(space, "boundary")  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
-    check_baseline_affordable(space, lambda parameters: count_cost(parameters).flops_per_particle)
+    check_baseline_affordable(space, count_cost)
     storage = open_storage(run.path / "optuna.journal", storage_url)
     known = [record.id for record in run.trials()]
     pools = []

@@ -60,6 +60,7 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
             ray.init(num_cpus=study.concurrency, **own, **QUIET)
         else:
             _join(address)
+        ray._private.worker._worker_logs_enabled = False  # our records say what died
         yield RayPool(study, problem, folder)
     finally:
         ray.shutdown()

@@ -66,9 +66,13 @@ def _draw_affordable(space: SearchSpace, rng: np.random.Generator, affordable: A
         if affordable(parameters):
             return parameters
     raise ConfigError(
-        f"search space {space.name!r}: none of {MAX_DRAWS} random configurations is below `max_flops_per_particle` = "
-        f"{space.max_flops_per_particle}; raise the cap or narrow the space."
+        f"search space {space.name!r}: none of {MAX_DRAWS} random configurations is below its caps ({_caps(space)}); "
+        "raise a cap or narrow the space."
     )
+
+
+def _caps(space: SearchSpace) -> str:
+    return ", ".join(f"`max_{name}` = {cap:g}" for name, cap in space.caps.items())
 
 
 def suggest_parameters(

@@ -62,10 +62,10 @@ class Session:
         return self.space if refined is None else load_space(self.run.path / "stages" / f"{refined}.toml")
 
     def affordable(self, parameters: Mapping) -> bool:
-        """Whether a configuration is below the space's cap on cost, and possible in this scene."""
-        cap = self.space.max_flops_per_particle
+        """Whether a configuration is below the space's caps on cost, and possible in this scene."""
+        caps = self.space.caps
         try:
-            return cap is None or self.count_cost(parameters).flops_per_particle <= cap
+            return not caps or all(getattr(self.count_cost(parameters), name) <= cap for name, cap in caps.items())
         except ConfigError:
             return False
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from cconv.errors import ConfigError, did_you_mean
+from cconv.evaluation.cost_model import Estimate
 from cconv.study.config import TrainingConfig, read_toml
 from cconv.study.domains import Choice, FloatRange, IntRange, Parameter, SearchSpace, Value, fixed, narrowed
 from cconv.training.field_model import NetworkConfig
@@ -57,25 +58,23 @@ def _check_possible(parameters: Mapping[str, Value], what: str) -> None:
         raise ConfigError(f"{what} is not possible ({error.errors()[0]['msg']}).") from error
 
 
-def check_baseline_affordable(space: SearchSpace, flops_of: Callable[[Mapping[str, Value]], float]) -> None:
-    """Refuse a space whose own baseline costs more than its cap, once the scene is known.
+def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str, Value]], Estimate]) -> None:
+    """Refuse a space whose own baseline costs more than its caps, once the scene is known.
 
     Args:
         space: The search space.
-        flops_of: Multiplications and additions of one particle's prediction by a configuration.
+        cost_of: Cost of one particle's prediction by a configuration.
 
     Raises:
-        ConfigError: If the baseline is above the cap.
+        ConfigError: If the baseline is above a cap.
     """
-    cap = space.max_flops_per_particle
-    if cap is None:
-        return
-    cost = flops_of(space.baseline)
-    if cost > cap:
-        raise ConfigError(
-            f"search space {space.name!r}: its baseline costs {cost:.3g} FLOPs per particle in this scene, above "
-            f"`max_flops_per_particle` = {cap:.3g}; raise the cap or take a cheaper baseline."
-        )
+    for name, cap in space.caps.items():
+        cost = getattr(cost_of(space.baseline), name)
+        if cost > cap:
+            raise ConfigError(
+                f"search space {space.name!r}: its baseline costs {cost:.3g} {name.replace('_', ' ')} in this scene, "
+                f"above `max_{name}` = {cap:.3g}; raise the cap or take a cheaper baseline."
+            )
 
 
 def configure(

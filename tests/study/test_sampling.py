@@ -112,7 +112,7 @@ def test_a_random_configuration_depends_on_seed_and_index_alone():
 
 def test_a_cap_below_everything_is_refused():
     space = SPACE.model_copy(update={"max_flops_per_particle": 5.0})
-    message = "none of 1000 random configurations is below `max_flops_per_particle` = 5.0"
+    message = "none of 1000 random configurations is below its caps .`max_flops_per_particle` = 5"
     with pytest.raises(ConfigError, match=message):
         random_parameters(space, 0, 0, lambda parameters: False)
     with pytest.raises(ConfigError, match=message):

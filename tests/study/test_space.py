@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from cconv.errors import ConfigError
+from cconv.evaluation.cost_model import Estimate
 from cconv.study.closed_form import single_layers
 from cconv.study.config import TrainingConfig
 from cconv.study.space import (
@@ -152,10 +153,17 @@ def test_single_layers_of_the_density_space_are_distinct_configurations_with_all
 
 def test_a_baseline_above_the_cap_is_refused():
     space = conditional_space().model_copy(update={"max_flops_per_particle": 2e6})
-    check_baseline_affordable(space, lambda parameters: 1e6 if parameters == space.baseline else 3e6)
-    check_baseline_affordable(conditional_space(), lambda parameters: 1e9)
-    with pytest.raises(ConfigError, match=r"'c': its baseline costs 3e\+06 FLOPs .* `max_flops_per_particle` = 2e"):
-        check_baseline_affordable(space, lambda parameters: 3e6)
+    check_baseline_affordable(space, lambda parameters: costing(1e6 if parameters == space.baseline else 3e6))
+    check_baseline_affordable(conditional_space(), lambda parameters: costing(1e9))
+    with pytest.raises(ConfigError, match=r"'c': its baseline costs 3e\+06 flops .* `max_flops_per_particle` = 2e"):
+        check_baseline_affordable(space, lambda parameters: costing(3e6))
+    space = conditional_space().model_copy(update={"max_bytes_per_particle": 1e3})
+    with pytest.raises(ConfigError, match="costs 2e.03 bytes per particle .* `max_bytes_per_particle` = 1e"):
+        check_baseline_affordable(space, lambda parameters: costing(3e6))
+
+
+def costing(flops):
+    return Estimate(flops_per_particle=flops, bytes_per_particle=2e3)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,169 @@
+"""A study on a cluster of two Ray nodes, one of which is killed during the search."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from contextlib import ExitStack, contextmanager
+
+import optuna
+import pytest
+from conftest import SCRIPT, SMOKE
+from outcomes import assert_one_clear_line
+from processes import kill_tree, names
+
+from cconv.study.optuna_mirror import open_storage
+from cconv.study.records import RunFolder
+
+STUDY = """
+name = "clustered"
+task = "density_gradient"
+
+[network]
+layers = 2
+first_channels = 4
+hidden_channels = 8
+
+[training]
+updates = 36
+evaluate_every = 4
+
+[search]
+space = "{space}"
+grace_updates = 4
+concurrency = 2
+
+[stages.random]
+trials = 6
+
+[stages.adaptive]
+trials = 2
+"""
+
+
+@pytest.fixture
+def study_file(tmp_path):
+    path = tmp_path / "clustered.toml"
+    path.write_text(STUDY.format(space=SMOKE.parents[1] / "search_spaces" / "smoke.toml"))
+    return path
+
+
+@pytest.fixture
+def nodes():
+    """Address of a cluster, and the processes of its two nodes with a core each."""
+    address = f"127.0.0.1:{free_port()}"
+    head = ["--head", f"--port={address.partition(':')[2]}", "--include-dashboard=false"]
+    with ExitStack() as stack:
+        first = stack.enter_context(node(*head, "--dashboard-agent-listen-port=0"))
+        wait_until(lambda: listens(address), first)
+        yield address, first, stack.enter_context(node(f"--address={address}"))
+
+
+@contextmanager
+def node(*arguments):
+    settings = ("--block", "--num-cpus=1", "--object-store-memory=100000000", "--disable-usage-stats")
+    ports = ("--min-worker-port=0", "--max-worker-port=0")  # any: two nodes share this machine
+    folder = tempfile.mkdtemp(prefix="ray_")  # short, as names of sockets must be
+    process = subprocess.Popen(
+        [SCRIPT.parent / "ray", "start", *arguments, *settings, *ports, f"--temp-dir={folder}"],
+        env=os.environ | {"RAY_AUTH_MODE": "disabled"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        kill_tree(process.pid)
+        process.wait()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def free_port():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def listens(address):
+    host, _, port = address.partition(":")
+    with socket.socket() as probe:
+        return probe.connect_ex((host, int(port))) == 0
+
+
+def wait_until(holds, *processes, timeout=90):
+    deadline = time.monotonic() + timeout
+    while not holds():
+        assert all(process.poll() is None for process in processes), "a process ended too early"
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.02)
+
+
+def logs(folder):
+    return {log.parent.name: log.read_text().splitlines() for log in folder.glob("trials/*/log.jsonl")}
+
+
+def is_training(process):
+    return any(title.startswith("ray::ImplicitFunc") for title in names(process.pid))
+
+
+@contextmanager
+def started(command):
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        kill_tree(process.pid)
+        process.communicate()
+
+
+@pytest.mark.timeout(300)
+def test_a_study_survives_the_death_of_a_node_without_losing_a_trial(nodes, study_file, flow_folder, tmp_path):
+    address, _, second = nodes
+    folder = tmp_path / "run"
+    command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", address]
+    with started(command) as study:
+        wait_until(lambda: sum(map(len, logs(folder).values())) >= 8 and is_training(second), study, second)
+        before = logs(folder)
+        kill_tree(second.pid)
+        _, errors = study.communicate(timeout=150)
+    assert study.returncode == 0, errors
+    assert_whole(folder)
+    after = logs(folder)
+    for trial, entries in before.items():  # kept to the second, so not trained again; the last may have been cut short
+        assert after[trial][: len(entries) - 1] == entries[:-1]
+
+
+def assert_whole(folder):
+    """All trials ended as a search ends them, with every evaluation on the way; so say the rungs and Optuna."""
+    run = RunFolder.open(folder)
+    records = run.trials()
+    assert len(records) == 8
+    for record in records:
+        assert record.outcome in ("completed", "stopped", "diverged"), record.reason
+        assert [entry["updates"] for entry in record.log] == list(range(4, record.log[-1]["updates"] + 1, 4))
+    rungs = json.loads((folder / "rungs.json").read_text())
+    for stage, entries in rungs.items():
+        for rung in entries:
+            reached = {
+                record.id: entry["valid_normalized_mse"]
+                for record in run.trials_of(stage)
+                for entry in record.log
+                if entry["updates"] == rung["updates"]
+            }
+            assert rung["recorded"] == reached
+    storage = open_storage(folder / "optuna.journal")
+    states = [trial.state for trial in optuna.load_study(study_name="clustered", storage=storage).trials]
+    assert len(states) == 8
+    assert all(state.is_finished() for state in states)
+
+
+def test_a_cluster_that_is_not_there_is_one_line_and_the_same_command_works_later(study_file, flow_folder, tmp_path):
+    folder = tmp_path / "run"
+    command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", "127.0.0.1:1"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    last = run.stderr.splitlines(keepends=True)[-1]
+    assert_one_clear_line((run.returncode, run.stdout, last), "--address 127.0.0.1:1", "ray start --head")
+    assert not folder.exists()
