@@ -39,15 +39,16 @@ def adaptive_search(session: Session, stage: str) -> dict:
             yield trial_job(session, stage, number, recorded_parameters(session.run, stage, number) or propose(number))
 
     def propose(number: int) -> dict:
-        records = [*earlier, *session.run.trials_of(stage)]
+        known = [*earlier, *session.run.trials_of(stage)]
+        costs = {record.id: record.config["flops_per_particle"] for record in known}
         return suggest_parameters(
             space,
-            records,
+            [record for record in known if costs[record.id] is not None],  # the others failed before they began
             number=number,
             seed=session.seed_of(stage),
             full_updates=study.training.updates,
             affordable=session.affordable,
-            costs={record.id: record.config["flops_per_particle"] for record in records},
+            costs=costs,
         )
 
     _search(session, stage, jobs(), settings.trials)

@@ -105,8 +105,8 @@ def test_one_whose_process_dies_is_given_up_and_one_that_hangs_is_ended_at_its_l
 
 def test_one_that_takes_too_long_is_stopped_and_the_record_names_the_limit(train):
     endless = [f"{key}=1000000" for key in ("training.updates", "training.evaluate_every", "search.grace_updates")]
-    reason = "it trained longer than its limit of 3 seconds"
-    assert train([0], *endless, "search.trial_seconds=3") == {0: ("stopped", reason)}
+    reason = "it trained longer than its limit of 10 seconds"
+    assert train([0], *endless, "search.trial_seconds=10") == {0: ("stopped", reason)}
 
 
 def test_a_full_disk_ends_the_run_in_one_line_and_gives_no_training_an_outcome(train, tmp_path):
