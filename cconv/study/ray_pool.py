@@ -57,7 +57,7 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
     try:
         if address is None:
             own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
-            ray.init(num_cpus=study.concurrency, **own, **QUIET)
+            ray.init("local", num_cpus=study.concurrency, **own, **QUIET)
         else:
             _join(address)
         ray._private.worker._worker_logs_enabled = False  # our records say what died

@@ -7,7 +7,8 @@ import socket
 import subprocess
 import tempfile
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from pathlib import Path
 
 import optuna
 import pytest
@@ -53,27 +54,28 @@ def study_file(tmp_path):
 
 @pytest.fixture
 def nodes():
-    """Address of a cluster, and the processes of its two nodes with a core each."""
+    """Address of a cluster, and the process of the second of its two nodes with a core each."""
     address = f"127.0.0.1:{free_port()}"
     head = ["--head", f"--port={address.partition(':')[2]}", "--include-dashboard=false"]
-    with ExitStack() as stack:
-        first = stack.enter_context(node(*head, "--dashboard-agent-listen-port=0"))
-        wait_until(lambda: listens(address), first)
-        yield address, first, stack.enter_context(node(f"--address={address}"))
+    with node(*head, "--dashboard-agent-listen-port=0"), node(f"--address={address}") as second:
+        yield address, second
 
 
 @contextmanager
 def node(*arguments):
     settings = ("--block", "--num-cpus=1", "--object-store-memory=100000000", "--disable-usage-stats")
     ports = ("--min-worker-port=0", "--max-worker-port=0")  # any: two nodes share this machine
-    folder = tempfile.mkdtemp(prefix="ray_")  # short, as names of sockets must be
-    process = subprocess.Popen(
-        [SCRIPT.parent / "ray", "start", *arguments, *settings, *ports, f"--temp-dir={folder}"],
-        env=os.environ | {"RAY_AUTH_MODE": "disabled"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    folder = Path(tempfile.mkdtemp(prefix="ray_"))  # short, as names of sockets must be
+    printed = folder / "printed.txt"
+    with printed.open("w") as file:
+        process = subprocess.Popen(
+            [SCRIPT.parent / "ray", "start", *arguments, *settings, *ports, f"--temp-dir={folder}"],
+            env=os.environ | {"RAY_AUTH_MODE": "disabled"},
+            stdout=file,
+            stderr=subprocess.STDOUT,
+        )
     try:
+        wait_until(lambda: "Ray runtime started" in printed.read_text(), process, said=printed)
         yield process
     finally:
         kill_tree(process.pid)
@@ -87,16 +89,10 @@ def free_port():
         return free.getsockname()[1]
 
 
-def listens(address):
-    host, _, port = address.partition(":")
-    with socket.socket() as probe:
-        return probe.connect_ex((host, int(port))) == 0
-
-
-def wait_until(holds, *processes, timeout=90):
+def wait_until(holds, *processes, said=None, timeout=90):
     deadline = time.monotonic() + timeout
     while not holds():
-        assert all(process.poll() is None for process in processes), "a process ended too early"
+        assert all(process.poll() is None for process in processes), said and said.read_text()
         assert time.monotonic() < deadline, "nothing happened in time"
         time.sleep(0.02)
 
@@ -121,7 +117,7 @@ def started(command):
 
 @pytest.mark.timeout(300)
 def test_a_study_survives_the_death_of_a_node_without_losing_a_trial(nodes, study_file, flow_folder, tmp_path):
-    address, _, second = nodes
+    address, second = nodes
     folder = tmp_path / "run"
     command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", address]
     with started(command) as study:
