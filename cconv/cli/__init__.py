@@ -1,6 +1,7 @@
 """The command line: the only place that parses arguments and prints."""
 
 import sys
+from errno import EDQUOT, ENOSPC
 
 import typer
 
@@ -34,7 +35,9 @@ def main() -> None:
         sys.exit(2)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        errors.print(f"cconv: {place}{error.strerror}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        remedy = "; make room, then `cconv study resume` goes on" if error.errno in (ENOSPC, EDQUOT) else ""
+        line = f"cconv: {place}{error.strerror}{remedy}"
+        errors.print(line, style="bold red", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

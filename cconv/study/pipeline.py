@@ -1,6 +1,7 @@
 """The whole study: one stage after another, each from the records of those before it, each where it was left."""
 
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
@@ -14,7 +15,7 @@ from cconv.study.environment import describe_environment
 from cconv.study.finalists import retrain_finalists
 from cconv.study.initialization import train_unstopped
 from cconv.study.observer import Observer
-from cconv.study.optuna_mirror import OptunaMirror, open_storage
+from cconv.study.optuna_mirror import OptunaMirror, database_answers, open_storage
 from cconv.study.problem import load_problem, open_study_data, with_data_path
 from cconv.study.ray_pool import ray_pool
 from cconv.study.reading_stages import measure_importance, refine_space
@@ -121,13 +122,14 @@ def move_data(run: RunFolder, path: str) -> None:
 
 
 def write_study(run: RunFolder, study: StudyConfig) -> None:
-    """Write study.json."""
-    run.write("study.json", {"format": FORMAT, **study.model_dump(mode="json")})
+    """Write study.json, with an id that tells the run from others of the same name in a database."""
+    written = run.read("study.json") if (run.path / "study.json").is_file() else {"id": uuid.uuid4().hex[:8]}
+    run.write("study.json", {"format": FORMAT, "id": written["id"], **study.model_dump(mode="json")})
 
 
 def recorded_study(run: RunFolder) -> StudyConfig:
     """The study of a run folder."""
-    values = {key: value for key, value in run.read("study.json").items() if key != "format"}
+    values = {key: value for key, value in run.read("study.json").items() if key not in ("format", "id")}
     return validated(StudyConfig, values, run.path / "study.json")
 
 
@@ -164,13 +166,17 @@ def _session(
     known = [record.id for record in run.trials()]
     pools = []
     with ExitStack() as stack:
+        stack.enter_context(database_answers(storage_url))
 
         def start_pool():
             if not pools:
                 pools.append(stack.enter_context(ray_pool(study, problem, run.path / "ray", address)))
             return pools[0]
 
-        mirror = OptunaMirror(storage, study.name, space, study.training.updates, known)
+        if address is not None:
+            start_pool()  # a cluster that is not there is told before anything is computed
+        name = study.name if storage_url is None else f"{study.name}-{run.read('study.json')['id']}"
+        mirror = OptunaMirror(storage, name, space, study.training.updates, known)
         stack.callback(mirror.end_running)
         yield Session(
             study=study,

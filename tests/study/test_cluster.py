@@ -129,7 +129,8 @@ def test_a_study_survives_the_death_of_a_node_without_losing_a_trial(nodes, stud
     assert_whole(folder)
     after = logs(folder)
     for trial, entries in before.items():  # kept to the second, so not trained again; the last may have been cut short
-        assert after[trial][: len(entries) - 1] == entries[:-1]
+        kept = entries[:-1]
+        assert after[trial][: len(kept)] == kept
 
 
 def assert_whole(folder):

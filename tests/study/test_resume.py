@@ -1,14 +1,13 @@
 """A study whose whole process tree is killed goes on to the rungs of one that was not."""
 
 import json
-import os
-import signal
 import subprocess
 import time
 
 import pytest
 from conftest import SCRIPT, SMOKE
 from outcomes import assert_one_clear_line
+from processes import kill_tree
 
 from cconv.study.records import RunFolder
 
@@ -58,15 +57,6 @@ def kill_after(command, folder, count, timeout=150):
     assert process.poll() is None, "the study ended before it could be killed"
     kill_tree(process.pid)
     process.wait()
-
-
-def kill_tree(pid):
-    """SIGKILL a process and all that descend from it, also those that left its group."""
-    children = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()
-    os.kill(pid, signal.SIGSTOP)
-    for child in children:
-        kill_tree(int(child))
-    os.kill(pid, signal.SIGKILL)
 
 
 def without_times(log):
