@@ -22,7 +22,10 @@ BRANCHES = ("boundary", "density")
 
 
 def ablate(session: Session, stage: str) -> dict:
-    """Retrain the path and the turned-over models; returns "ablation" with "path" and "branches"."""
+    """Retrain the path and the turned-over models; returns "ablation" with "path" and "branches".
+
+    A step of the path above the space's caps on cost is not trained and has no error.
+    """
     finalists = _finalists(session, stage)
     trained = [finalist for finalist in finalists if not finalist.records[0].is_closed_form]
     found = [finalist for finalist in trained if finalist.id != BASELINE]
@@ -31,8 +34,12 @@ def ablate(session: Session, stage: str) -> dict:
     branches = _turned_over(session, best)
     seeds, first = session.study.stages[stage].seeds, session.study.seeds.init + 1
     to_train = path if best.records[0].is_closed_form else path | branches
+    affordable = {name: each for name, each in to_train.items() if session.affordable(each)}
     jobs = finalist_jobs(
-        [Finalist(id=f"{stage}_{name}", parameters=each) for name, each in to_train.items()], seeds, first, session.run
+        [Finalist(id=f"{stage}_{name}", parameters=each) for name, each in affordable.items()],
+        seeds,
+        first,
+        session.run,
     )
     train_all(session, stage, jobs, finalist_training(session.study))
     if best.records[0].is_closed_form:
