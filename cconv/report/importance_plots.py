@@ -97,11 +97,8 @@ def _dependence(axes: Axes, dependence: Mapping) -> None:
         axes.fill_between(positions, dependence["low"], dependence["high"], color=_ABOVE, alpha=0.2, lw=0)
         axes.plot(positions, dependence["error"], color=_ABOVE, label="surrogate", zorder=3)
         return
-    below = [error - low for error, low in zip(dependence["error"], dependence["low"], strict=True)]
-    above = [high - error for error, high in zip(dependence["error"], dependence["high"], strict=True)]
-    axes.errorbar(
-        positions, dependence["error"], [below, above], fmt="o", color=_ABOVE, capsize=4, label="surrogate", zorder=3
-    )
+    axes.vlines(positions, dependence["low"], dependence["high"], color=_ABOVE, lw=1.5)
+    axes.plot(positions, dependence["error"], "o", color=_ABOVE, label="surrogate", zorder=3)
     labels = [str(value) for value in values]
     axes.set_xticks(positions, [label.replace("_to_", "_to_\n", 1) for label in labels])
     axes.tick_params(axis="x", labelsize=8)
