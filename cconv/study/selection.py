@@ -10,6 +10,7 @@ from cconv.errors import DataError
 from cconv.evaluation.statistics import PairedDifference, crossed_standard_error, paired_difference
 from cconv.study.records import TrialRecord
 
+SHOWN_FAILURES = 2  # of a model, in words
 RULES = ("one_standard_error", "non_inferiority", "accurate_enough")
 
 
@@ -190,7 +191,7 @@ def _compare(
         "accurate_enough": accurate_enough is not None and error <= accurate_enough,
     }
     unstable = any_stable and bool(failures)
-    why_not = f"failed {'; '.join(failures)}" if unstable else "" if any(good.values()) else "less accurate"
+    why_not = f"failed {_shortly(failures)}" if unstable else "" if any(good.values()) else "less accurate"
     return Comparison(
         id=name,
         error=error,
@@ -243,13 +244,18 @@ def _stability(chosen: Comparison, comparisons: Sequence[Comparison]) -> str:
     if not chosen.stable:
         return (
             "No model passed every check of stability, so all were chosen from; see what failed before use: "
-            f"{'; '.join(chosen.failures)}."
+            f"{_shortly(chosen.failures)}."
         )
     unstable = [each for each in comparisons if not each.stable]
     if not unstable:
         return "Every model passed every check of stability."
-    causes = "; ".join(f"{each.id} ({'; '.join(each.failures)})" for each in unstable)
+    causes = "; ".join(f"{each.id} ({_shortly(each.failures)})" for each in unstable)
     return (
         f"It passed every check of stability; {len(unstable)} of {len(comparisons)} models did not and were set aside: "
         f"{causes}."
     )
+
+
+def _shortly(failures: Sequence[str]) -> str:
+    more = len(failures) - SHOWN_FAILURES
+    return "; ".join(failures[:SHOWN_FAILURES]) + (f"; and {more} more" if more > 0 else "")
