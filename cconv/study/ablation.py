@@ -11,7 +11,6 @@ import numpy as np
 from cconv.study.ablation_path import ablation_order, path_configurations
 from cconv.study.closed_form import fit_whole
 from cconv.study.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
-from cconv.study.rung_audit import error_at
 from cconv.study.search import train_all
 from cconv.study.session import BASELINE, Session
 from cconv.study.space import configure
@@ -72,7 +71,7 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
     """
     best, baseline = min(found, key=_mean_error).records[0].parameters, session.space.baseline
     known = session.read(stage, "initialization", "random")
-    errors = {updates: [error_at(record, updates) for record in known] for updates in session.study.rungs}
+    errors = {updates: [record.error_at(updates) for record in known] for updates in session.study.rungs}
     enough = [updates for updates, at in errors.items() if len(at) - at.count(None) >= FEWEST_TRIALS]
     if not enough:
         return {}

@@ -81,6 +81,10 @@ class TrialRecord:
         finite = (entry["valid_normalized_mse"] for entry in self.log)
         return min((error for error in finite if error is not None), default=math.inf)
 
+    def error_at(self, updates: int) -> float | None:
+        """Validation error after a number of updates; None if it was not measured there or not finite."""
+        return next((entry["valid_normalized_mse"] for entry in self.log if entry["updates"] == updates), None)
+
     @property
     def last(self) -> dict | None:
         """The last evaluation with a finite error, or None."""

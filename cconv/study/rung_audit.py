@@ -14,11 +14,6 @@ FEWEST_TRIALS = 4
 MEASURES = ("spearman", "kendall", "crossing_rate", "recall", "survival", "regret")
 
 
-def error_at(record: TrialRecord, updates: int) -> float | None:
-    """Validation error of a trial after a number of updates; None if it was not measured there or not finite."""
-    return next((entry["valid_normalized_mse"] for entry in record.log if entry["updates"] == updates), None)
-
-
 def audit_rungs(
     records: Sequence[TrialRecord],
     rungs: Sequence[int],
@@ -67,7 +62,7 @@ def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: fl
 
 def _errors_at_both(records: Sequence[TrialRecord], updates: int) -> tuple[np.ndarray, np.ndarray]:
     completed = [record for record in records if record.outcome == "completed" and record.last]
-    pairs = [(error_at(record, updates), record.last["valid_normalized_mse"]) for record in completed]
+    pairs = [(record.error_at(updates), record.last["valid_normalized_mse"]) for record in completed]
     at_rung, at_full = np.array([pair for pair in pairs if pair[0] is not None]).reshape(-1, 2).T
     return at_rung, at_full
 

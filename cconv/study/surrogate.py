@@ -108,7 +108,7 @@ def _error_at(record: TrialRecord, updates: int, after: int) -> float | None:
         useless = error is None or error > USELESS_ERROR
         if record.outcome == "diverged" or (record.outcome == "stopped" and useless):
             return USELESS_ERROR
-    return next((entry["valid_normalized_mse"] for entry in record.log if entry["updates"] == updates), None)
+    return record.error_at(updates)
 
 
 class Surrogate:

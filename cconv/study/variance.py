@@ -7,7 +7,6 @@ import numpy as np
 import scipy.stats
 
 from cconv.study.records import TrialRecord
-from cconv.study.rung_audit import error_at
 
 FEWEST_VALUES = 4
 
@@ -88,5 +87,5 @@ def _bootstrap_interval(
 
 
 def _logarithms(records: Sequence[TrialRecord], updates: int) -> np.ndarray:
-    errors = [error_at(record, updates) for record in records]
+    errors = [record.error_at(updates) for record in records]
     return np.log10([error for error in errors if error is not None and error > 0])

@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from cconv.study.records import TrialRecord
-from cconv.study.rung_audit import MEASURES, audit_rungs, error_at, rung_measures
+from cconv.study.rung_audit import MEASURES, audit_rungs, rung_measures
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def trials(rng, noise, count=32):
 
 def test_an_error_counts_where_it_was_measured():
     record = trial("a", {10: 0.5, 30: None})
-    assert [error_at(record, updates) for updates in (10, 20, 30)] == [0.5, None, None]
+    assert [record.error_at(updates) for updates in (10, 20, 30)] == [0.5, None, None]
 
 
 def test_the_same_order_is_perfect_and_the_opposite_one_is_not():
