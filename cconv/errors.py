@@ -1,7 +1,9 @@
 """Errors that a user can act on: what must hold, what came, what to do."""
 
 import difflib
+import os
 from collections.abc import Iterable
+from errno import EDQUOT, ENOSPC
 
 
 class CConvError(ValueError):
@@ -52,3 +54,8 @@ def did_you_mean(value: object, known: Iterable[str]) -> str:
     """A hint ``' Did you mean ...?'`` with the nearest known name, or an empty string."""
     nearest = difflib.get_close_matches(str(value), list(known), n=1, cutoff=0.5)
     return f" Did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def is_disk_full(error: Exception) -> bool:
+    """Whether there was no room to write; told by its words, as not every library raises an OSError."""
+    return any(os.strerror(code) in str(error) for code in (ENOSPC, EDQUOT))

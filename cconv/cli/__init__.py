@@ -1,7 +1,6 @@
 """The command line: the only place that parses arguments and prints."""
 
 import sys
-from errno import EDQUOT, ENOSPC
 
 import typer
 
@@ -9,7 +8,7 @@ from cconv.cli.console import errors
 from cconv.cli.data import app as data_app
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.study import app as study_app
-from cconv.errors import CConvError
+from cconv.errors import CConvError, is_disk_full
 
 INTERRUPTED = 130
 
@@ -35,7 +34,7 @@ def main() -> None:
         sys.exit(2)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        remedy = "; make room, then `cconv study resume` goes on" if error.errno in (ENOSPC, EDQUOT) else ""
+        remedy = "; make room, then `cconv study resume` goes on" if is_disk_full(error) else ""
         line = f"cconv: {place}{error.strerror}{remedy}"
         errors.print(line, style="bold red", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)

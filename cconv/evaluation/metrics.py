@@ -8,6 +8,7 @@ import scipy.stats
 import torch
 
 from cconv.data.targets import Sample
+from cconv.evaluation.statistics import crossed_standard_error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,11 +97,9 @@ def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.
 def crossed_interval(values: np.ndarray, mean: float, confidence: float = 0.95) -> tuple[float, float]:
     r"""Interval of a mean error over seeds and units, both seen as draws of many.
 
-    With :math:`s_a^2, s_b^2` the variances of the means of rows and columns, the variance of the mean is taken as
-    :math:`s_a^2/A + s_b^2/B`, with Satterthwaite's degrees of freedom (Satterthwaite, "An approximate distribution of
-    estimates of variance components", Biometrics Bulletin 2 (1946)). Two or three seeds are too few to resample; the
-    t-distribution says so by a wide interval. It is symmetric on a log scale, as errors are positive. With a single
-    unit it covers the seeds alone.
+    From the standard error and degrees of freedom of `crossed_standard_error`. Two or three seeds are too few to
+    resample; the t-distribution says so by a wide interval. It is symmetric on a log scale, as errors are positive.
+    With a single unit it covers the seeds alone.
 
     Args:
         values: Errors (seeds, units), at least two seeds.
@@ -110,11 +109,8 @@ def crossed_interval(values: np.ndarray, mean: float, confidence: float = 0.95) 
     Returns:
         Lower and upper end.
     """
-    parts = [means.var(ddof=1) / len(means) for means in (values.mean(axis=1), values.mean(axis=0)) if len(means) > 1]
-    counts = [count for count in values.shape if count > 1]
-    variance = sum(parts)
-    if variance == 0 or mean <= 0:
+    error, freedom = crossed_standard_error(values)
+    if error == 0 or mean <= 0:
         return mean, mean
-    freedom = variance**2 / sum(part**2 / (count - 1) for part, count in zip(parts, counts, strict=True))
-    width = scipy.stats.t.ppf((1 + confidence) / 2, freedom) * variance**0.5 / mean
+    width = scipy.stats.t.ppf((1 + confidence) / 2, freedom) * error / mean
     return float(mean * np.exp(-width)), float(mean * np.exp(width))

@@ -14,7 +14,6 @@ import numpy as np
 from cconv.data.splits import evenly_spaced
 from cconv.data.targets import Sample
 from cconv.errors import ConfigError
-from cconv.evaluation.cost import flops_per_particle
 from cconv.evaluation.metrics import frame_errors, normalized_mse
 from cconv.study.problem import provenance
 from cconv.study.records import TrialFolder, TrialRecord
@@ -23,6 +22,7 @@ from cconv.study.selection import choose_finalists
 from cconv.study.session import Session
 from cconv.study.space import Choice, Parameter, SearchSpace, Value, configure
 from cconv.study.stages import reads_of
+from cconv.study.trial import describe
 from cconv.training.checkpoint import save_model
 from cconv.training.closed_form import solve_closed_form
 from cconv.training.field_model import NetworkConfig
@@ -157,15 +157,9 @@ def _fit_and_record(
     study, problem = session.study, session.problem
     network, training = configure(parameters, study.network, study.training)
     model = problem.build_model(network, 0)
-    config = {
-        "stage": stage,
-        "parameters": dict(parameters),
-        "network": network.model_dump(),
-        "training": training.model_dump() | {"updates": 0},
-        "init_seed": init_seed,
-        "data_seed": study.seeds.data,
-        "num_parameters": model.num_parameters,
-        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
+    untrained = training.model_copy(update={"updates": 0})
+    seeds = {"init_seed": init_seed, "data_seed": study.seeds.data}
+    config = describe(problem, parameters, model, untrained, stage=stage, **seeds) | {
         "closed_form": True,
         "ridge": ridge,
     }

@@ -1,6 +1,5 @@
 """Trainings side by side with Ray Tune, on this machine or on a cluster."""
 
-import errno
 import os
 import shutil
 import socket
@@ -29,7 +28,7 @@ from ray import tune  # noqa: E402
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
-from cconv.errors import ConfigError  # noqa: E402
+from cconv.errors import ConfigError, is_disk_full  # noqa: E402
 from cconv.study.attempt import Attempt  # noqa: E402
 from cconv.study.config import StudyConfig, TrainingConfig  # noqa: E402
 from cconv.study.problem import Problem, provenance  # noqa: E402
@@ -253,7 +252,7 @@ def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: Stu
         if not last["diverged"] and last["updates"] < training.updates:
             outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
     except Exception as error:
-        outcome, reason = DISK_FULL if _is_disk_full(error) else "failed", str(error) or type(error).__name__
+        outcome, reason = DISK_FULL if is_disk_full(error) else "failed", str(error) or type(error).__name__
     if outcome is not None:
         _record_what_failed(job, stage, outcome)
         tune.report(last | {"outcome": outcome, "reason": reason})
@@ -281,11 +280,6 @@ def _trial(
         seconds_limit=study.search.trial_seconds,
         on_update=check_before_writing,
     )
-
-
-def _is_disk_full(error: Exception) -> bool:
-    """By its words, as not every library that writes raises an OSError."""
-    return any(os.strerror(code) in str(error) for code in (errno.ENOSPC, errno.EDQUOT))
 
 
 def _record_what_failed(job: Job, stage: str, outcome: str) -> None:

@@ -7,6 +7,7 @@ goes on as it would have, and one that finished takes more trials.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from cconv.errors import ConfigError
 from cconv.study.asha import RungFile
 from cconv.study.config import TrainingConfig
 from cconv.study.records import RunFolder, TrialFolder, TrialRecord, read_json
@@ -96,8 +97,17 @@ def trial_name(stage: str, number: int) -> str:
 
 
 def trial_job(session: Session, stage: str, number: int, parameters: Mapping, init_seed: int | None = None) -> Job:
-    """A trial of a stage, with the seed that all trials of searches share unless another is given."""
+    """A trial of a stage, with the seed that all trials of searches share unless another is given.
+
+    Raises:
+        ConfigError: If the trial was begun with other parameters.
+    """
     name = trial_name(stage, number)
+    if recorded_parameters(session.run, stage, number) not in (None, dict(parameters)):
+        raise ConfigError(
+            f"{session.run.trial(name).path}: was begun with other parameters than the study now gives it, as "
+            "study.json, space.json or earlier records were changed; undo that, or run the study into another folder."
+        )
     return Job(
         folder=session.run.trial(name).path.absolute(),
         name=name,
@@ -125,12 +135,7 @@ def _best_at_first_rung(session: Session, search: str) -> dict:
     full, first = session.study.training.updates, session.study.rungs[0]
     records = session.run.trials_of(search)
     spent = sum(record.log[-1]["updates"] for record in records if record.log)
-    at_first = {
-        record.id: entry["valid_normalized_mse"]
-        for record in records
-        for entry in record.log
-        if entry["updates"] == first and entry["valid_normalized_mse"] is not None
-    }
+    at_first = {record.id: error for record in records if (error := record.error_at(first)) is not None}
     affordable = max(1, int((spent - len(records) * first) // max(full - first, 1)))
     best = sorted(at_first, key=at_first.__getitem__)[:affordable]
     return {"trials": len(records), "kept": [record for record in records if record.id in best]}

@@ -49,16 +49,7 @@ def run_trial(
     """
     network, training = configure(parameters, network, training)
     model = problem.build_model(network, init_seed)
-    config = {
-        "stage": stage,
-        "parameters": dict(parameters),
-        "network": network.model_dump(),
-        "training": training.model_dump(),
-        "init_seed": init_seed,
-        "data_seed": data_seed,
-        "num_parameters": model.num_parameters,
-        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
-    }
+    config = describe(problem, parameters, model, training, stage=stage, init_seed=init_seed, data_seed=data_seed)
     progress = _begin_or_go_on(model, folder, config)
     card = config | dict(provenance)
     best = _best_so_far(folder)
@@ -93,6 +84,29 @@ def run_trial(
         if not folder.checkpoint.exists():
             save_model(model, folder.checkpoint, card | {"valid_normalized_mse": None})
         raise
+
+
+def describe(
+    problem: Problem,
+    parameters: Mapping,
+    model: FieldModel,
+    training: TrainingConfig,
+    *,
+    stage: str,
+    init_seed: int,
+    data_seed: int,
+) -> dict:
+    """What config.json says of a model and its training before it begins; arguments as of `run_trial`."""
+    return {
+        "stage": stage,
+        "parameters": dict(parameters),
+        "network": model.config.network.model_dump(),
+        "training": training.model_dump(),
+        "init_seed": init_seed,
+        "data_seed": data_seed,
+        "num_parameters": model.num_parameters,
+        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
+    }
 
 
 def _begin_or_go_on(model: FieldModel, folder: TrialFolder, config: Mapping) -> Progress:

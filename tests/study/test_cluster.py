@@ -12,44 +12,18 @@ from pathlib import Path
 
 import optuna
 import pytest
-from conftest import SCRIPT, SMOKE
+from conftest import SCRIPT
 from outcomes import assert_one_clear_line
 from processes import kill_tree, names
+from studies import write_search
 
 from cconv.study.optuna_mirror import open_storage
 from cconv.study.records import RunFolder
 
-STUDY = """
-name = "clustered"
-task = "density_gradient"
-
-[network]
-layers = 2
-first_channels = 4
-hidden_channels = 8
-
-[training]
-updates = 36
-evaluate_every = 4
-
-[search]
-space = "{space}"
-grace_updates = 4
-concurrency = 2
-
-[stages.random]
-trials = 6
-
-[stages.adaptive]
-trials = 2
-"""
-
 
 @pytest.fixture
 def study_file(tmp_path):
-    path = tmp_path / "clustered.toml"
-    path.write_text(STUDY.format(space=SMOKE.parents[1] / "search_spaces" / "smoke.toml"))
-    return path
+    return write_search(tmp_path, "clustered", concurrency=2, random=6, adaptive=2)
 
 
 @pytest.fixture

@@ -5,43 +5,17 @@ import subprocess
 import time
 
 import pytest
-from conftest import SCRIPT, SMOKE
+from conftest import SCRIPT
 from outcomes import assert_one_clear_line
 from processes import kill_tree
+from studies import write_search
 
 from cconv.study.records import RunFolder
-
-STUDY = """
-name = "killed"
-task = "density_gradient"
-
-[network]
-layers = 2
-first_channels = 4
-hidden_channels = 8
-
-[training]
-updates = 36
-evaluate_every = 4
-
-[search]
-space = "{space}"
-grace_updates = 4
-concurrency = 1
-
-[stages.random]
-trials = 5
-
-[stages.adaptive]
-trials = 3
-"""
 
 
 @pytest.fixture(scope="module")
 def study_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("studies") / "killed.toml"
-    path.write_text(STUDY.format(space=SMOKE.parents[1] / "search_spaces" / "smoke.toml"))
-    return path
+    return write_search(tmp_path_factory.mktemp("studies"), "killed", concurrency=1, random=5, adaptive=3)
 
 
 def evaluations(folder):
