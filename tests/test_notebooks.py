@@ -56,7 +56,7 @@ def test_a_notebook_shows_charts_and_tables(path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "charts"), [("search", 4), ("importance", 3), ("finalists", 5), ("stability", 2), ("cost", 2)]
+    ("name", "charts"), [("search", 4), ("importance", 4), ("finalists", 5), ("stability", 2), ("cost", 2)]
 )
 def test_a_notebook_shows_all_that_was_recorded(name, charts, whole_run, monkeypatch):
     """Its cells in this process, which starts no kernel and draws nothing."""

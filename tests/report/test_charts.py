@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -90,8 +91,12 @@ def test_interactive_chart_shows_every_point_with_its_hyperparameters(summary):
     assert len(texts) == len(points)
     for name, count in points["name"].value_counts().items():  # a finalist bears the name of the trial that found it
         assert sum(f"<b>{name}</b>" in text for text in texts) == count
+    entries = [*summary["search_points"], *(entry["config"] | {"id": entry["id"]} for entry in summary["finalists"])]
+    parameters = {entry["id"]: entry["parameters"] for entry in entries}
     for text in texts:
-        assert ANALYTIC in text or ("learning_rate = " in text and "parameters" in text and "ms per frame" in text)
+        name = re.match("<b>(.*?)</b>", text)[1]
+        assert "ms per frame" in text
+        assert name == ANALYTIC or ("parameters" in text and all(f"{each} = " in text for each in parameters[name]))
     assert (figure.layout.xaxis.type, figure.layout.yaxis.type) == ("log", "log")
 
 

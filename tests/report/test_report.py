@@ -16,13 +16,13 @@ from cconv.study.records import RunFolder
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 OPTIONAL = (
     "search_points", "analytic", "front", "growth", "rung_audit", "references", "importance", "ablation", "selection",
-    "initialization", "refined",
+    "initialization", "refined", "partial_dependence",
 )  # fmt: skip
 
 
 def old_run(folder):
     """A run whose summary has no more than any version of the summary has."""
-    run = RunFolder(shutil.copytree(SAMPLE, folder / "run"))
+    run = RunFolder(shutil.copytree(SAMPLE, folder / "run", ignore=shutil.ignore_patterns("explanation")))
     summary = {key: value for key, value in run.read("summary.json").items() if key not in OPTIONAL}
     for entry in summary["finalists"]:
         entry["stability"] = None
