@@ -79,6 +79,7 @@ def _search_parts(run: RunFolder) -> dict:
 
 def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
     return {
+        "reason": _lead(summary["recommended"]["reason"]),
         "comparison": _comparison(summary),
         "chart": interactive_html(summary),
         "charts": {name: _picture(draw(summary)) for name, draw in _CHARTS.items() if summary.get(name)}
@@ -87,6 +88,12 @@ def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
         "stability": verdict_matrix(summary),
         "explained": _explained(run, summary),
     }
+
+
+def _lead(text: str) -> tuple[str, str]:
+    """The first sentence and the others."""
+    first, stop, others = text.partition(". ")
+    return first + stop.strip(), others
 
 
 def _comparison(summary: Mapping) -> dict:
@@ -143,7 +150,10 @@ def _number(value: float | int | bool | str | None, digits: int = 3) -> str:
         return "–"
     if isinstance(value, bool | str):
         return {True: "yes", False: "no"}.get(value, str(value))
-    return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}g}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:,.0f}" if 1000 <= abs(rounded) < 1e6 else f"{rounded:.{digits}g}"
 
 
 def _duration(seconds: float) -> str:

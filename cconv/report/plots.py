@@ -12,6 +12,7 @@ from cconv.report.tables import AUDIT_MEASURES, growth_table, rung_audit_table, 
 from cconv.report.verdicts import verdict_matrix
 
 _ERROR = "validation error (normalized MSE)"
+_BESIDE = {"fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
 
 
 def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> Figure:
@@ -47,7 +48,7 @@ def best_so_far_chart(trials: pd.DataFrame) -> Figure:
     complete = trials["valid_normalized_mse"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
     axes.set(yscale="log", xlabel="trial", ylabel="last validation error (normalized MSE)", title="search")
-    axes.legend(fontsize=8)
+    axes.legend(**_BESIDE)
     return figure
 
 
@@ -57,7 +58,7 @@ def strategies_chart(summary: Mapping) -> Figure:
     for name, curve in strategies_table(summary).groupby("strategy", sort=False):
         axes.step(curve["updates"], curve["error"], where="post", marker=".", label=name)
     axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_ERROR, title="best so far, by strategy")
-    _legend(axes)
+    axes.legend(**_BESIDE)
     return figure
 
 
