@@ -28,6 +28,7 @@ from cconv.training.closed_form import solve_closed_form
 from cconv.training.field_model import NetworkConfig
 
 STAGE = "closed_form"
+BRANCHES = ("boundary", "density")  # what a model may do without
 _OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message", "boundary", "density")
 _OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"), "radial": ("radial_terms",)}
 
@@ -112,8 +113,10 @@ def _winners(session: Session, stage: str) -> list[TrialRecord]:
     return choose_finalists(records, cost, count, session.study.selection.accurate_enough)
 
 
-def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> list[TrialRecord]:
-    """Fit the best candidates to the whole training split; each once, as nothing in it is drawn.
+def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[str, dict[str, Value]]:
+    """Fit the best candidates to the whole training split, without the branches and features that they do not need.
+
+    Each is fitted once, as nothing in it is drawn.
 
     Args:
         session: The study.
@@ -121,17 +124,37 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> list[T
         seed: Seed that names the folder.
 
     Returns:
-        The candidates that were chosen.
+        Hyperparameters of the finalists, by id; that of one that lost a branch says so.
     """
-    study, chosen = session.study, []
+    study, chosen = session.study, {}
     for name in reads_of(study.stages, stage):
         if study.stages[name].kind == STAGE:
-            best, ridge = _winners(session, name), study.stages[name].ridge
-            for record in session.progress(best, "closed-form finalists"):
-                folder = session.run.finalist(record.id, seed)
-                fit_whole(session, record.parameters, folder, "finalists", seed, ridge)
-            chosen += best
-    return chosen
+            for record in session.progress(_winners(session, name), "closed-form finalists"):
+                finalist, parameters = _lean(session, record, seed, study.stages[name].ridge)
+                chosen.setdefault(layer_id(parameters), (finalist, parameters))
+    return dict(chosen.values())
+
+
+def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> tuple[str, dict[str, Value]]:
+    """Id and hyperparameters of a candidate without the `BRANCHES` whose loss its validation error does not show.
+
+    A branch goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
+    """
+
+    def fitted(finalist: str, parameters: Mapping[str, Value]) -> float:
+        folder = session.run.finalist(finalist, seed)
+        fit_whole(session, parameters, folder, "finalists", seed, ridge)
+        return folder.read().best
+
+    finalist, parameters = candidate.id, candidate.parameters
+    error = fitted(finalist, parameters)
+    for branch in BRANCHES:
+        if parameters.get(branch) and False in session.space.parameters[branch].values:
+            fewer = parameters | {branch: False}
+            error_without = fitted(f"{finalist}_no_{branch}", fewer)
+            if error_without <= error * (1 + session.study.selection.margin):
+                finalist, parameters, error = f"{finalist}_no_{branch}", fewer, error_without
+    return finalist, parameters
 
 
 def fit_whole(
@@ -152,6 +175,7 @@ def _fit_and_record(
     ridge: float,
 ) -> None:
     """Fit a layer to the first of `samples` and record its error on the second. No weight depends on the seed."""
+    folder.check_begun_with(parameters)
     if folder.ended:
         return
     study, problem = session.study, session.problem

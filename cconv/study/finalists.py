@@ -18,7 +18,7 @@ from cconv.evaluation.metrics import (
 )
 from cconv.study.closed_form import fit_closed_form_finalists
 from cconv.study.config import StudyConfig, TrainingConfig
-from cconv.study.records import RunFolder, TrialRecord
+from cconv.study.records import RunFolder, TrialFolder, TrialRecord
 from cconv.study.search import train_all
 from cconv.study.selection import choose_finalists
 from cconv.study.session import BASELINE, Session
@@ -80,7 +80,7 @@ def retrain_finalists(session: Session, stage: str) -> dict:
     trained = [Finalist(id=name, parameters=parameters) for name, parameters in (named | searched).items()]
     jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
     train_all(session, FINALISTS, jobs, finalist_training(study))
-    return {"finalists": named | searched | {record.id: record.parameters for record in closed}}
+    return {"finalists": named | searched | closed}
 
 
 def best_trials(session: Session, stage: str) -> list[TrialRecord]:
@@ -102,16 +102,18 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
 
     They run in this order; the costliest finalist, usually the baseline, is best given first.
     """
-    return [
-        Job(
-            folder=run.finalist(finalist.id, seed).path.absolute(),
-            name=f"{finalist.id}/seed_{seed}",
-            parameters=finalist.parameters,
-            init_seed=seed,
-        )
-        for finalist in finalists
-        for seed in range(first_seed, first_seed + num_seeds)
-    ]
+    seeds = range(first_seed, first_seed + num_seeds)
+    return [_finalist_job(finalist, seed, run.finalist(finalist.id, seed)) for finalist in finalists for seed in seeds]
+
+
+def _finalist_job(finalist: Finalist, seed: int, folder: TrialFolder) -> Job:
+    folder.check_begun_with(finalist.parameters)
+    return Job(
+        folder=folder.path.absolute(),
+        name=f"{finalist.id}/seed_{seed}",
+        parameters=finalist.parameters,
+        init_seed=seed,
+    )
 
 
 def retrained_finalists(

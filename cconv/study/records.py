@@ -105,6 +105,20 @@ class TrialFolder:
         """Whether the configuration has been written."""
         return (self.path / "config.json").is_file()
 
+    @property
+    def parameters(self) -> dict | None:
+        """Hyperparameters of the configuration; None before it has been written."""
+        return read_json(self.path / "config.json")["parameters"] if self.started else None
+
+    def check_begun_with(self, parameters: Mapping) -> None:
+        """Raise `ConfigError` if the trial was begun with other hyperparameters."""
+        if self.parameters not in (None, dict(parameters)):
+            raise ConfigError(
+                f"{self.path}: was begun with other hyperparameters than the study now gives it, as study.json, "
+                "space.json or earlier records were changed; undo that, or delete this folder, or run the study into "
+                "another one."
+            )
+
     def start(self, config: Mapping) -> None:
         """Begin an empty log, then write the configuration, by which a reader knows that there is a trial."""
         self.path.mkdir(parents=True, exist_ok=True)

@@ -7,10 +7,9 @@ goes on as it would have, and one that finished takes more trials.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from cconv.errors import ConfigError
 from cconv.study.asha import RungFile
 from cconv.study.config import TrainingConfig
-from cconv.study.records import RunFolder, TrialFolder, TrialRecord, read_json
+from cconv.study.records import TrialFolder, TrialRecord
 from cconv.study.replay import best_so_far, spent_updates
 from cconv.study.sampling import random_parameters, suggest_parameters
 from cconv.study.session import Session
@@ -37,7 +36,8 @@ def adaptive_search(session: Session, stage: str) -> dict:
 
     def jobs() -> Iterator[Job]:
         for number in range(settings.trials):
-            yield trial_job(session, stage, number, recorded_parameters(session.run, stage, number) or propose(number))
+            recorded = session.run.trial(trial_name(stage, number)).parameters
+            yield trial_job(session, stage, number, recorded or propose(number))
 
     def propose(number: int) -> dict:
         known = [*earlier, *session.run.trials_of(stage)]
@@ -85,31 +85,18 @@ def train_all(session: Session, stage: str, jobs: Sequence[Job], training: Train
         session.start_pool().run(queue, stage, training)
 
 
-def recorded_parameters(run: RunFolder, stage: str, number: int) -> dict | None:
-    """Parameters of a trial that has begun; None for one that has not."""
-    folder = run.trial(trial_name(stage, number))
-    return read_json(folder.path / "config.json")["parameters"] if folder.started else None
-
-
 def trial_name(stage: str, number: int) -> str:
     """Id of a stage's trial."""
     return f"{stage}_{number:04d}"
 
 
 def trial_job(session: Session, stage: str, number: int, parameters: Mapping, init_seed: int | None = None) -> Job:
-    """A trial of a stage, with the seed that all trials of searches share unless another is given.
-
-    Raises:
-        ConfigError: If the trial was begun with other parameters.
-    """
+    """A trial of a stage, with the seed that all trials of searches share unless another is given."""
     name = trial_name(stage, number)
-    if recorded_parameters(session.run, stage, number) not in (None, dict(parameters)):
-        raise ConfigError(
-            f"{session.run.trial(name).path}: was begun with other parameters than the study now gives it, as "
-            "study.json, space.json or earlier records were changed; undo that, or run the study into another folder."
-        )
+    folder = session.run.trial(name)
+    folder.check_begun_with(parameters)
     return Job(
-        folder=session.run.trial(name).path.absolute(),
+        folder=folder.path.absolute(),
         name=name,
         parameters=dict(parameters),
         init_seed=session.study.seeds.init if init_seed is None else init_seed,

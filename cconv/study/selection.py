@@ -209,8 +209,14 @@ def _choice(
 ) -> str:
     figures = f"test error {chosen.error:.3g} at {chosen.cost:.3g} ms per frame"
     if chosen is best:
-        cheaper = any(each.cost < best.cost and (each.stable or not best.stable) for each in comparisons)
-        why = "no cheaper one is as accurate" if cheaper else "it is also the cheapest"
+        cheaper = [each for each in comparisons if each.cost < best.cost]
+        why = (
+            "it is also the cheapest"
+            if not cheaper
+            else "no cheaper one is as accurate"
+            if any(each.stable or not best.stable for each in cheaper)
+            else "no cheaper one is stable"
+        )
         return f"{best.id} is the most accurate model ({figures}), and {why}."
     rules = {
         "one_standard_error": "within one standard error of the best",

@@ -7,7 +7,7 @@ import pytest
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
 from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.closed_form import STAGE, _draw, _neighbors, single_layers
+from cconv.study.closed_form import BRANCHES, STAGE, _draw, _neighbors, single_layers
 from cconv.study.records import RunFolder
 from cconv.study.space import SearchSpace, load_space
 from cconv.training.field_model import NetworkConfig
@@ -60,9 +60,9 @@ def run(finished_run):
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
     screened = [record for record in run.trials() if record.stage == STAGE]
     best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
-    (record,) = run.retrainings()[best.id]
+    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"].startswith(best.id))
+    (record,) = run.retrainings()[entry["id"]]
     assert record.is_closed_form
-    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
     model = load_model(run.path / entry["checkpoint"])
     samples = list(iterate_samples(open_dataset(flow_folder), "test", "density_gradient", model.kernel))
     assert entry["test"]["normalized_mse"] == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
@@ -72,6 +72,18 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
     card = json.loads((run.path / entry["checkpoint"] / "card.json").read_text())
     assert card["closed_form"]
     assert card["test"]["ci95"] == entry["test"]["ci95"]
+
+
+def test_a_finalist_keeps_no_branch_that_its_error_does_not_need(run):
+    fits = {name: records[0] for name, records in run.retrainings().items() if name.startswith(STAGE)}
+    margin = 1 + run.read("study.json")["selection"]["margin"]
+    finalists = [entry["id"] for entry in run.read("summary.json")["finalists"] if entry["id"] in fits]
+    assert finalists
+    for name in finalists:
+        kept = [branch for branch in BRANCHES if fits[name].parameters.get(branch)]
+        assert all(fits[f"{name}_no_{branch}"].best > margin * fits[name].best for branch in kept)
+        with_more, _, _ = name.rpartition("_no_")
+        assert not with_more or fits[name].best <= margin * fits[with_more].best
 
 
 def test_candidates_go_on_from_the_would_be_finalists(run):

@@ -20,5 +20,5 @@ def test_a_trial_that_was_begun_goes_on_only_with_its_own_parameters(session):
     job = trial_job(session, "random", 3, parameters)
     session.run.trial(job.name).start({"stage": "random", "parameters": parameters, "init_seed": job.init_seed})
     assert trial_job(session, "random", 3, parameters) == job
-    with pytest.raises(ConfigError, match=r"random_0003: was begun with other parameters"):
+    with pytest.raises(ConfigError, match=r"random_0003: was begun with other hyperparameters"):
         trial_job(session, "random", 3, parameters | {"layers": 3})

@@ -100,6 +100,12 @@ def test_a_model_that_failed_a_check_of_stability_is_set_aside_beside_one_that_p
     assert "No model passed every check" in chosen.reason
 
 
+def test_a_cheaper_model_that_is_unstable_is_not_called_costlier(noise):
+    chosen = recommend({"best": noise, "wild": 2 * noise}, {"best": 2.0, "wild": 1.0}, {"wild": ["float32"]})
+    assert chosen.id == "best"
+    assert "no cheaper one is stable" in chosen.reason
+
+
 def test_accurate_enough_does_not_excuse_instability(noise):
     errors, cost = {"steady": noise, "wild": 1e-9 * noise}, {"steady": 2.0, "wild": 1.0}
     assert recommend(errors, cost, {"wild": ["float32"]}, accurate_enough=1e-3).id == "steady"
