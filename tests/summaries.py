@@ -42,7 +42,13 @@ def whole_summary(summary: dict) -> dict:
         ],
         "branches": [
             {"left_out": "dense", "normalized_mse": 0.004, "ms_per_frame": 3.9, "ratio": 4.21},
-            {"left_out": "boundary", "valid_normalized_mse": 0.002, "of": 0.001, "flops_per_particle": 900.0},
+            {
+                "left_out": "boundary",
+                "valid_normalized_mse": 0.002,
+                "of": 0.001,
+                "flops_per_particle": 900.0,
+                "parameters": {"boundary": True},
+            },
             {"left_out": "density", "valid_normalized_mse": None, "of": 0.001, "flops_per_particle": None},
         ],
     }

@@ -185,10 +185,13 @@ def status(
 
 def _finalists_table(summary: dict) -> Table:
     table = Table(
-        title=f"{summary['study']}: test errors and cost of the finalists", title_justify="left", padding=(0, 0)
+        title=f"{summary['study']}: test error (normalized MSE) and cost of the finalists",
+        title_justify="left",
+        padding=(0, 0),
     )
-    for name in ("model", "normalized MSE", "95 % interval", "ms per frame", "parameters", "stable"):
-        table.add_column(name, justify="left" if name == "model" else "right", no_wrap=True)
+    table.add_column("model", overflow="fold")
+    for name in ("error", "95 % interval", "ms per frame", "parameters", "stable"):
+        table.add_column(name, justify="right", no_wrap=True)
     for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
         test, cost = entry["test"], entry["cost"]
         mark = " *" if entry["id"] == summary["recommended"]["id"] else ""

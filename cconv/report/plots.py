@@ -89,7 +89,7 @@ def growth_chart(summary: Mapping) -> Figure:
         band = {"color": line.get_color(), "alpha": 0.2, "lw": 0}
         axes.fill_between(times["num_particles"], times["ms_low"], times["ms_high"], **band)
     axes.set(xscale="log", yscale="log", xlabel="particles N", ylabel="time per frame [ms]", title="growth of the cost")
-    _legend(axes)
+    axes.legend(**_BESIDE)
     return figure
 
 

@@ -73,7 +73,17 @@ def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
         "answer", "chart", "finalists", "sure", "stability", "cost", "search", "importance", "ablation", "learned",
         "provenance", "glossary",
     ]  # fmt: skip
-    for figure in ("7.52 (7.21 to 7.93)", "22.4 %", "4.21", "1.03", "loses good trials", "less accurate than the"):
+    for figure in (
+        "7.52 (7.21 to 7.93)",
+        "22.4 %",
+        "4.21",
+        "1.03",
+        "loses good trials",
+        "less accurate than the",
+        "dense left out",
+        "boundary added",
+        "density left out",
+    ):
         assert figure in whole_report
 
 
