@@ -12,7 +12,7 @@ from cconv.report.tables import AUDIT_MEASURES, growth_table, rung_audit_table, 
 from cconv.report.verdicts import verdict_matrix
 
 _ERROR = "validation error (normalized MSE)"
-_BESIDE = {"fontsize": 8, "loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
+_BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
 
 
 def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> Figure:
@@ -48,7 +48,7 @@ def best_so_far_chart(trials: pd.DataFrame) -> Figure:
     complete = trials["valid_normalized_mse"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
     axes.set(yscale="log", xlabel="trial", ylabel="last validation error (normalized MSE)", title="search")
-    axes.legend(**_BESIDE)
+    _legend(axes, **_BESIDE)
     return figure
 
 
@@ -58,7 +58,7 @@ def strategies_chart(summary: Mapping) -> Figure:
     for name, curve in strategies_table(summary).groupby("strategy", sort=False):
         axes.step(curve["updates"], curve["error"], where="post", marker=".", label=name)
     axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_ERROR, title="best so far, by strategy")
-    axes.legend(**_BESIDE)
+    _legend(axes, **_BESIDE)
     return figure
 
 
@@ -89,7 +89,7 @@ def growth_chart(summary: Mapping) -> Figure:
         band = {"color": line.get_color(), "alpha": 0.2, "lw": 0}
         axes.fill_between(times["num_particles"], times["ms_low"], times["ms_high"], **band)
     axes.set(xscale="log", yscale="log", xlabel="particles N", ylabel="time per frame [ms]", title="growth of the cost")
-    axes.legend(**_BESIDE)
+    _legend(axes, **_BESIDE)
     return figure
 
 
@@ -146,6 +146,6 @@ def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, A
         return figure, figure.subplots(1, columns)
 
 
-def _legend(axes: Axes) -> None:
+def _legend(axes: Axes, **place) -> None:
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, **place)

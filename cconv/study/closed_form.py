@@ -150,10 +150,10 @@ def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> 
     error = fitted(finalist, parameters)
     for branch in BRANCHES:
         if parameters.get(branch) and False in session.space.parameters[branch].values:
-            fewer = parameters | {branch: False}
-            error_without = fitted(f"{finalist}_no_{branch}", fewer)
+            leaner, fewer = f"{finalist}_no_{branch}", parameters | {branch: False}
+            error_without = fitted(leaner, fewer)
             if error_without <= error * (1 + session.study.selection.margin):
-                finalist, parameters, error = f"{finalist}_no_{branch}", fewer, error_without
+                finalist, parameters, error = leaner, fewer, error_without
     return finalist, parameters
 
 

@@ -18,11 +18,11 @@ from cconv.evaluation.metrics import (
 )
 from cconv.study.closed_form import fit_closed_form_finalists
 from cconv.study.config import StudyConfig, TrainingConfig
-from cconv.study.records import RunFolder, TrialFolder, TrialRecord
+from cconv.study.records import RunFolder, TrialRecord
 from cconv.study.search import train_all
 from cconv.study.selection import choose_finalists
 from cconv.study.session import BASELINE, Session
-from cconv.study.trial_queue import Job
+from cconv.study.trial_queue import Job, job_in
 from cconv.training.checkpoint import load_model, read_card, save_model
 
 FINALISTS = "finalists"
@@ -102,18 +102,11 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
 
     They run in this order; the costliest finalist, usually the baseline, is best given first.
     """
-    seeds = range(first_seed, first_seed + num_seeds)
-    return [_finalist_job(finalist, seed, run.finalist(finalist.id, seed)) for finalist in finalists for seed in seeds]
-
-
-def _finalist_job(finalist: Finalist, seed: int, folder: TrialFolder) -> Job:
-    folder.check_begun_with(finalist.parameters)
-    return Job(
-        folder=folder.path.absolute(),
-        name=f"{finalist.id}/seed_{seed}",
-        parameters=finalist.parameters,
-        init_seed=seed,
-    )
+    return [
+        job_in(run.finalist(finalist.id, seed), f"{finalist.id}/seed_{seed}", finalist.parameters, seed)
+        for finalist in finalists
+        for seed in range(first_seed, first_seed + num_seeds)
+    ]
 
 
 def retrained_finalists(

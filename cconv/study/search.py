@@ -13,7 +13,7 @@ from cconv.study.records import TrialFolder, TrialRecord
 from cconv.study.replay import best_so_far, spent_updates
 from cconv.study.sampling import random_parameters, suggest_parameters
 from cconv.study.session import Session
-from cconv.study.trial_queue import Job, NothingStops, StopsByRungs, TrialQueue
+from cconv.study.trial_queue import Job, NothingStops, StopsByRungs, TrialQueue, job_in
 
 
 def random_search(session: Session, stage: str) -> dict:
@@ -93,14 +93,8 @@ def trial_name(stage: str, number: int) -> str:
 def trial_job(session: Session, stage: str, number: int, parameters: Mapping, init_seed: int | None = None) -> Job:
     """A trial of a stage, with the seed that all trials of searches share unless another is given."""
     name = trial_name(stage, number)
-    folder = session.run.trial(name)
-    folder.check_begun_with(parameters)
-    return Job(
-        folder=folder.path.absolute(),
-        name=name,
-        parameters=dict(parameters),
-        init_seed=session.study.seeds.init if init_seed is None else init_seed,
-    )
+    seed = session.study.seeds.init if init_seed is None else init_seed
+    return job_in(session.run.trial(name), name, parameters, seed)
 
 
 def _search(session: Session, stage: str, jobs: Iterator[Job], num_trials: int) -> None:

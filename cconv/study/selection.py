@@ -210,14 +210,7 @@ def _choice(
     figures = f"test error {chosen.error:.3g} at {chosen.cost:.3g} ms per frame"
     if chosen is best:
         cheaper = [each for each in comparisons if each.cost < best.cost]
-        why = (
-            "it is also the cheapest"
-            if not cheaper
-            else "no cheaper one is as accurate"
-            if any(each.stable or not best.stable for each in cheaper)
-            else "no cheaper one is stable"
-        )
-        return f"{best.id} is the most accurate model ({figures}), and {why}."
+        return f"{best.id} is the most accurate model ({figures}), and {_none_cheaper(best, cheaper)}."
     rules = {
         "one_standard_error": "within one standard error of the best",
         "non_inferiority": "not inferior to the best",
@@ -228,6 +221,14 @@ def _choice(
         f"{chosen.id} is the cheapest model ({figures}) that is {passed}. The best is {best.id} with {best.error:.3g} "
         f"at {best.cost:.3g} ms per frame, {best.cost / chosen.cost:.3g} times the cost.{_ratio(chosen)}"
     )
+
+
+def _none_cheaper(best: Comparison, cheaper: Sequence[Comparison]) -> str:
+    if not cheaper:
+        return "it is also the cheapest"
+    if any(each.stable or not best.stable for each in cheaper):
+        return "no cheaper one is as accurate"
+    return "no cheaper one is stable"
 
 
 def _ratio(chosen: Comparison) -> str:

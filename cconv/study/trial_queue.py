@@ -27,6 +27,16 @@ class Job:
     init_seed: int
 
 
+def job_in(folder: TrialFolder, name: str, parameters: Mapping, init_seed: int) -> Job:
+    """A training that is recorded in a folder.
+
+    Raises:
+        ConfigError: If the folder's training was begun with other hyperparameters.
+    """
+    folder.check_begun_with(parameters)
+    return Job(folder=folder.path.absolute(), name=name, parameters=dict(parameters), init_seed=init_seed)
+
+
 class NothingStops:
     """Judge of trainings that all go to the end."""
 

@@ -1,13 +1,15 @@
 """The closed-form stage: which layers are tried, and what becomes of the best."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
 from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.closed_form import BRANCHES, STAGE, _draw, _neighbors, single_layers
+from cconv.study import closed_form
+from cconv.study.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, single_layers
 from cconv.study.records import RunFolder
 from cconv.study.space import SearchSpace, load_space
 from cconv.training.field_model import NetworkConfig
@@ -60,7 +62,7 @@ def run(finished_run):
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
     screened = [record for record in run.trials() if record.stage == STAGE]
     best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
-    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"].startswith(best.id))
+    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
     (record,) = run.retrainings()[entry["id"]]
     assert record.is_closed_form
     model = load_model(run.path / entry["checkpoint"])
@@ -74,16 +76,44 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
     assert card["test"]["ci95"] == entry["test"]["ci95"]
 
 
-def test_a_finalist_keeps_no_branch_that_its_error_does_not_need(run):
-    fits = {name: records[0] for name, records in run.retrainings().items() if name.startswith(STAGE)}
-    margin = 1 + run.read("study.json")["selection"]["margin"]
-    finalists = [entry["id"] for entry in run.read("summary.json")["finalists"] if entry["id"] in fits]
-    assert finalists
-    for name in finalists:
-        kept = [branch for branch in BRANCHES if fits[name].parameters.get(branch)]
-        assert all(fits[f"{name}_no_{branch}"].best > margin * fits[name].best for branch in kept)
-        with_more, _, _ = name.rpartition("_no_")
-        assert not with_more or fits[name].best <= margin * fits[with_more].best
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [
+        ({"boundary density": 1.0, "density": 1.04, "": 1.08}, ""),  # each within the margin of the one before
+        ({"boundary density": 1.0, "density": 1.06, "boundary": 0.5}, "boundary"),
+        ({"boundary density": 1.0, "density": 0.9, "": 0.96}, "density"),
+        ({"boundary density": 1.0, "density": 1.06, "boundary": 1.06}, "boundary density"),
+    ],
+)
+def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept, tmp_path, monkeypatch):
+    def fit(session, parameters, folder, stage, seed, ridge):
+        folder.start({"stage": stage, "parameters": parameters})
+        error = errors[" ".join(branch for branch in BRANCHES if parameters[branch])]
+        folder.append({"updates": 0, "valid_normalized_mse": error, "seconds": 1.0})
+
+    monkeypatch.setattr(closed_form, "fit_whole", fit)
+    space = space_of(boundary=[True, False], density=[True, False])
+    study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
+    session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
+    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True, "density": True})
+    finalist, parameters = _lean(session, candidate, seed=1, ridge=0.0)
+    assert " ".join(branch for branch in BRANCHES if parameters[branch]) == kept
+    assert finalist == "found" + "".join(f"_no_{branch}" for branch in BRANCHES if not parameters[branch])
+    assert session.run.finalist(finalist, 1).parameters == parameters
+
+
+def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkeypatch):
+    fitted = []
+
+    def fit(session, parameters, folder, stage, seed, ridge):
+        fitted.append(parameters)
+        folder.start({"stage": stage, "parameters": parameters})
+
+    monkeypatch.setattr(closed_form, "fit_whole", fit)
+    session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(boundary=[True]))
+    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True})
+    assert _lean(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
+    assert fitted == [candidate.parameters]
 
 
 def test_candidates_go_on_from_the_would_be_finalists(run):
