@@ -9,9 +9,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, uintp
+from numba import uintp
 
-_compile = njit(nogil=True, cache=True, error_model="numpy")
+from cconv.compiled import compile_cached
+
+_compile = compile_cached(nogil=True, error_model="numpy")
 
 _MAX_CELLS = 2**20  # along an axis: numbers of cells in three dimensions fit 63 bits, with room for one more
 _MARGIN = 1 + 1e-6  # of a cell's width over the cutoff, well above the rounding of coordinates counted in cells

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "cconv"
 
 # A module may import from its own tier and from those before it.
 TIERS = [
-    {"errors"},
+    {"compiled", "errors"},
     {"cell_list", "domain", "neighbors", "validation"},
     {"ops", "sph"},
     {"nn"},

@@ -7,7 +7,9 @@ Compiled code is cached on disk. Only contraction to fused multiply-adds is allo
 import numpy as np
 from numba import njit, uintp
 
-_compile = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+from cconv.compiled import compile_cached
+
+_compile = compile_cached(nogil=True, fastmath={"contract"}, error_model="numpy")
 
 
 @_compile

@@ -6,13 +6,14 @@ with their number: for few of them. Compiled as in `gathers`, but that sums may 
 
 import numpy as np
 import torch
-from numba import int32, njit, uintp
+from numba import int32, uintp
 from torch import Tensor
 
+from cconv.compiled import compile_cached
 from cconv.neighbors import Edges
 from cconv.ops.workers import run_on_workers
 
-_compile = njit(nogil=True, cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
+_compile = compile_cached(nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 
 EDGES_AT_A_TIME = 512  # worked on at a time: their values fit the innermost cache
 MOST_OUTPUTS = 20  # of a kind: more take longer than gathering messages and multiplying them with the filters

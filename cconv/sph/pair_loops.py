@@ -9,7 +9,9 @@ import math
 import numpy as np
 from numba import njit
 
-_compile = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+from cconv.compiled import compile_cached
+
+_compile = compile_cached(nogil=True, fastmath={"contract"}, error_model="numpy")
 
 
 @njit(inline="always", fastmath={"contract"}, error_model="numpy")

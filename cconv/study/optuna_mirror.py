@@ -5,7 +5,8 @@ is PRUNED with its errors at each evaluation, so that errors of different budget
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,11 +18,12 @@ from optuna.trial import Trial, TrialState, create_trial
 from sqlalchemy.exc import SQLAlchemyError
 
 from cconv.errors import ConfigError
-from cconv.study.records import DIVERGED_ERROR
+from cconv.study.records import DIVERGED_ERROR, TrialRecord
 from cconv.study.sampling import distributions_of
 from cconv.study.space import SearchSpace
 
 CONNECTION_SECONDS = 10
+LOCK_FILE_SUFFIX = ".lock"
 
 
 def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
@@ -42,6 +44,68 @@ def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
             f"--storage {_without_password(url)}: no database there that Optuna can use ({reason}); "
             "start it, or leave --storage out for a journal file in the run folder."
         ) from error
+
+
+def open_mirror(
+    journal: Path,
+    url: str | None,
+    study_name: str,
+    space: SearchSpace,
+    full_updates: int,
+    records: Sequence[TrialRecord],
+) -> "OptunaMirror":
+    """The mirror of a study in the database at `url`, or in a journal file that only this process writes.
+
+    A journal that is damaged or lacks trials is written anew from the records, and a lock that a killed process left
+    behind is removed.
+
+    Args:
+        journal: The journal file.
+        url: Database to use instead, or None.
+        study_name: Name of the Optuna study.
+        space: Search space of all trials.
+        full_updates: Full budget.
+        records: Trials of the searches so far.
+
+    Raises:
+        ConfigError: If the database cannot be reached or the journal not written.
+    """
+    known = [record.id for record in records]
+    if url is not None:
+        return OptunaMirror(open_storage(journal, url), study_name, space, full_updates, known)
+    try:
+        for left in journal.parent.glob(f"{journal.name}{LOCK_FILE_SUFFIX}*"):
+            _delete(left)
+        mirror = _readable_mirror(journal, study_name, space, full_updates, known)
+        if mirror is None or mirror.lacks(record.id for record in records if record.outcome != "interrupted"):
+            _delete(journal)
+            mirror = OptunaMirror(open_storage(journal), study_name, space, full_updates, [])
+            mirror.replay(records)
+    except OSError as error:
+        raise ConfigError(
+            f"{journal}: cannot be written ({error.strerror}); make its folder writable or give --storage URL."
+        ) from error
+    return mirror
+
+
+def _readable_mirror(
+    journal: Path, study_name: str, space: SearchSpace, full_updates: int, known: Iterable[str]
+) -> "OptunaMirror | None":
+    """The mirror in a journal; None where it holds anything that Optuna did not write."""
+    try:
+        if journal.exists() and not journal.read_bytes().endswith(b"\n"):
+            return None  # Optuna would append to half a line
+        return OptunaMirror(open_storage(journal), study_name, space, full_updates, known)
+    except Exception:  # what garbage raises depends on what it looks like
+        return None
+
+
+def _delete(path: Path) -> None:
+    """Delete a file, link or folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -95,6 +159,20 @@ class OptunaMirror:
                 self._numbers[name] = trial.number
             elif not trial.state.is_finished():
                 self._study.tell(trial.number, state=TrialState.FAIL)
+
+    def lacks(self, names: Iterable[str]) -> bool:
+        """Whether any of the named trials is not in the storage."""
+        present = {trial.user_attrs.get("trial") for trial in self._study.get_trials(deepcopy=False)}
+        return not set(names) <= present
+
+    def replay(self, records: Iterable[TrialRecord]) -> None:
+        """Add trials as their records tell them; one that was cut short is left running, as it goes on."""
+        for record in records:
+            self.on_trial_start(record.id, record.parameters)
+            for entry in record.log:
+                self.on_trial_result(record.id, entry)
+            if record.outcome != "interrupted":
+                self.on_trial_end(record.id, record.outcome, record.reason)
 
     def end_running(self) -> None:
         """Tell FAIL for every trial that is still running, so that none is left so when a run ends early."""

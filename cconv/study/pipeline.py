@@ -15,7 +15,7 @@ from cconv.study.environment import describe_environment
 from cconv.study.finalists import retrain_finalists
 from cconv.study.initialization import train_unstopped
 from cconv.study.observer import Observer
-from cconv.study.optuna_mirror import OptunaMirror, database_answers, open_storage
+from cconv.study.optuna_mirror import database_answers, open_mirror
 from cconv.study.problem import load_problem, open_study_data, with_data_path
 from cconv.study.ray_pool import ray_pool
 from cconv.study.reading_stages import measure_importance, refine_space
@@ -162,8 +162,8 @@ def _session(
         space = fixed(space, "boundary")  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
-    storage = open_storage(run.path / "optuna.journal", storage_url)
-    known = [record.id for record in run.trials()]
+    searches = [name for name, stage in study.stages.items() if stage.kind in ("random", "adaptive")]
+    records = [record for record in run.trials() if record.stage in searches]
     pools = []
     with ExitStack() as stack:
         stack.enter_context(database_answers(storage_url))
@@ -176,7 +176,7 @@ def _session(
         if address is not None:
             start_pool()  # a cluster that is not there is told before anything is computed
         name = study.name if storage_url is None else f"{study.name}-{run.read('study.json')['id']}"
-        mirror = OptunaMirror(storage, name, space, study.training.updates, known)
+        mirror = open_mirror(run.path / "optuna.journal", storage_url, name, space, study.training.updates, records)
         stack.callback(mirror.end_running)
         yield Session(
             study=study,

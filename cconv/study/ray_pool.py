@@ -4,13 +4,12 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import torch
 
 os.environ.update(
-    RAY_AUTH_MODE="disabled",  # tokens would be written to the home folder
     RAY_USAGE_STATS_ENABLED="0",
     RAY_CHDIR_TO_TRIAL_DIR="0",  # data paths stay valid
     RAY_AIR_NEW_OUTPUT="0",  # its boxes are printed even when silent
@@ -25,12 +24,20 @@ os.environ.update(
 
 import ray  # noqa: E402, its settings are read at import
 from ray import tune  # noqa: E402
+from ray.exceptions import RayError  # noqa: E402
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
 from cconv.errors import ConfigError, is_disk_full  # noqa: E402
 from cconv.study.attempt import Attempt  # noqa: E402
 from cconv.study.config import StudyConfig, TrainingConfig  # noqa: E402
+from cconv.study.private_ray import (  # noqa: E402
+    check_token_of_cluster,
+    demand_tokens,
+    on_loopback_alone,
+    private_folder,
+    token_of_this_run,
+)
 from cconv.study.problem import Problem, provenance  # noqa: E402
 from cconv.study.records import TrialFolder  # noqa: E402
 from cconv.study.trial import run_trial  # noqa: E402
@@ -49,21 +56,36 @@ DISK_FULL = "disk full"
 def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | None = None) -> Iterator["RayPool"]:
     """A private Ray on this machine with a core a training, or the cluster at `address`; its files go when it ends.
 
+    The private one listens on loopback alone and demands a token of this run; a cluster must demand the user's.
+
     Raises:
-        ConfigError: If there is no cluster at the address that can be joined.
+        ConfigError: If Ray cannot start here, or there is no cluster at the address that can be joined.
     """
     folder = folder.absolute()
-    try:
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        demand_tokens()
         if address is None:
-            own = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
-            ray.init("local", num_cpus=study.concurrency, **own, **QUIET)
-        else:
-            _join(address)
+            own = stack.enter_context(private_folder())
+            stack.enter_context(token_of_this_run(own))
+            stack.enter_context(on_loopback_alone())
+        stack.callback(ray.shutdown)
+        _start(study.concurrency, own) if address is None else _join(address)
         ray._private.worker._worker_logs_enabled = False  # our records say what died
         yield RayPool(study, problem, folder)
-    finally:
-        ray.shutdown()
-        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(cores: int, folder: Path) -> None:
+    """Start a Ray on this machine whose files are in `folder`."""
+    settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES, "_temp_dir": str(folder / "ray")}
+    try:
+        ray.init("local", num_cpus=cores, **settings, **QUIET)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"Ray does not start on this machine ({reason}); if it is the place for temporary files, set TMPDIR to a "
+            "short folder with room that you can write to."
+        ) from error
 
 
 def _join(address: str) -> None:
@@ -71,12 +93,16 @@ def _join(address: str) -> None:
     try:
         if port.isdigit():  # Ray itself would try for minutes
             socket.create_connection((host, int(port)), CONNECTION_SECONDS).close()
+        check_token_of_cluster(address)
         ray.init(address=address, **QUIET)
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, RayError) as error:
+        if isinstance(error, ConfigError):
+            raise
         reason = " ".join(str(error).split())
         raise ConfigError(
             f"--address {address}: no Ray cluster there that this machine can join ({reason}); start one with "
-            "`ray start --head`, on every machine from the same environment, and run this on one of them."
+            "`ray start --head`, on every machine from the same environment and with the same token, and run this on "
+            "one of them."
         ) from error
 
 

@@ -13,10 +13,12 @@ set -euo pipefail
 
 study=$1 data=$2 run=$3
 shift 3
-export RAY_AUTH_MODE=disabled RAY_USAGE_STATS_ENABLED=0
+export RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
+export RAY_AUTH_TOKEN_PATH="$HOME/.ray/cconv_$SLURM_JOB_ID" # a token of this job; homes are shared
+(umask 077 && mkdir -p "$HOME/.ray" && od -An -N32 -tx1 /dev/urandom | tr -d ' \n' > "$RAY_AUTH_TOKEN_PATH")
 node="--block --num-cpus=$SLURM_CPUS_PER_TASK --disable-usage-stats"
 address="$(hostname --ip-address | cut -d' ' -f1):$((20000 + SLURM_JOB_ID % 10000))"
-trap 'kill $(jobs -p)' EXIT
+trap 'kill $(jobs -p); rm -f "$RAY_AUTH_TOKEN_PATH"' EXIT
 
 # This script runs on the first node: the head of the cluster, where the study is driven from.
 ray start --head --node-ip-address="${address%:*}" --port="${address#*:}" --include-dashboard=false $node &

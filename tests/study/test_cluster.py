@@ -27,7 +27,16 @@ def study_file(tmp_path):
 
 
 @pytest.fixture
-def nodes():
+def token(tmp_path, monkeypatch):
+    """A token of a cluster, in a file that the environment names."""
+    path = tmp_path / "auth_token"
+    path.write_text("a" * 64)
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(path))
+    return path
+
+
+@pytest.fixture
+def nodes(token):
     """Address of a cluster, and the process of the second of its two nodes with a core each."""
     address = f"127.0.0.1:{free_port()}"
     head = ["--head", f"--port={address.partition(':')[2]}", "--include-dashboard=false"]
@@ -44,7 +53,7 @@ def node(*arguments):
     with printed.open("w") as file:
         process = subprocess.Popen(
             [SCRIPT.parent / "ray", "start", *arguments, *settings, *ports, f"--temp-dir={folder}"],
-            env=os.environ | {"RAY_AUTH_MODE": "disabled"},
+            env=os.environ | {"RAY_AUTH_MODE": "token"},
             stdout=file,
             stderr=subprocess.STDOUT,
         )
@@ -129,6 +138,19 @@ def assert_whole(folder):
     states = [trial.state for trial in optuna.load_study(study_name="clustered", storage=storage).trials]
     assert len(states) == 8
     assert all(state.is_finished() for state in states)
+
+
+@pytest.mark.parametrize(("given", "said"), [(None, "no token for this cluster"), ("b" * 64, "with the same token")])
+def test_a_cluster_whose_token_one_lacks_is_one_line(nodes, token, given, said, study_file, flow_folder, tmp_path):
+    address, _ = nodes
+    token.unlink() if given is None else token.write_text(given)
+    folder = tmp_path / "run"
+    command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", address]
+    environment = os.environ | {"HOME": str(tmp_path)}
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    last = run.stderr.splitlines(keepends=True)[-1]
+    assert_one_clear_line((run.returncode, run.stdout, last), f"--address {address}", said)
+    assert not folder.exists()
 
 
 def test_a_cluster_that_is_not_there_is_one_line_and_the_same_command_works_later(study_file, flow_folder, tmp_path):

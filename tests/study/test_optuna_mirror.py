@@ -5,8 +5,8 @@ import pytest
 from optuna.trial import TrialState
 
 from cconv.errors import ConfigError
-from cconv.study.optuna_mirror import OptunaMirror, open_storage
-from cconv.study.records import DIVERGED_ERROR
+from cconv.study.optuna_mirror import OptunaMirror, open_mirror, open_storage
+from cconv.study.records import DIVERGED_ERROR, TrialRecord
 from cconv.study.space import SearchSpace
 
 SPACE = SearchSpace.model_validate(
@@ -95,3 +95,71 @@ def test_any_database_that_optuna_knows_will_do(tmp_path):
     url = f"sqlite:///{tmp_path / 'studies.db'}"
     tell(OptunaMirror(open_storage(None, url), "s", SPACE, FULL, []), "a", [(9, 0.4)], "completed")
     assert optuna.load_study(study_name="s", storage=url).best_value == 0.4
+
+
+def record(name, errors, outcome):
+    log = [entry(updates, error) for updates, error in errors]
+    parameters = {"basis": "grid", "kernel_size": 4}
+    return TrialRecord(id=name, stage="random", parameters=parameters, config={}, log=log, outcome=outcome, reason="")
+
+
+RECORDS = [
+    record("full", [(3, 0.9), (9, 0.5)], "completed"),
+    record("stopped", [(3, 0.7)], "stopped"),
+    record("failed", [], "failed"),
+    record("cut", [(3, 0.6)], "interrupted"),
+]
+DAMAGE = {
+    "garbage line": lambda whole: whole + b"garbage\n",
+    "half a line": lambda whole: whole[: len(whole) * 2 // 3],
+    "NUL bytes": lambda whole: whole[:-20] + bytes(20),
+    "a line of another program": lambda whole: b"{}\n" + whole,
+    "nothing": lambda whole: b"",
+    "lost trials": lambda whole: b"".join(whole.splitlines(keepends=True)[:1]),
+    "deep nesting": lambda whole: whole + b"[" * 100_000 + b"\n",
+}
+
+
+def reopened(path):
+    return open_mirror(path / "optuna.journal", None, "s", SPACE, FULL, RECORDS)
+
+
+def told(path):
+    return [(trial.user_attrs["trial"], trial.state, trial.intermediate_values) for trial in trials(path)]
+
+
+TOLD = [
+    ("full", TrialState.COMPLETE, {3: 0.9, 9: 0.5}),
+    ("stopped", TrialState.PRUNED, {3: 0.7}),
+    ("failed", TrialState.FAIL, {}),
+    ("cut", TrialState.RUNNING, {3: 0.6}),
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_journal_is_written_anew_from_the_records(damage, tmp_path):
+    reopened(tmp_path)
+    journal = tmp_path / "optuna.journal"
+    journal.write_bytes(damage(journal.read_bytes()))
+    tell(reopened(tmp_path), "cut", [(9, 0.4)], "completed")
+    assert told(tmp_path) == [*TOLD[:3], ("cut", TrialState.COMPLETE, {3: 0.6, 9: 0.4})]
+
+
+def test_a_whole_journal_is_gone_on_with(tmp_path):
+    reopened(tmp_path)
+    before = (tmp_path / "optuna.journal").read_bytes()
+    reopened(tmp_path)
+    assert (tmp_path / "optuna.journal").read_bytes().startswith(before)
+    assert told(tmp_path) == TOLD
+
+
+def test_a_lock_left_behind_does_not_stop_a_study(tmp_path):
+    (tmp_path / "optuna.journal.lock").symlink_to(tmp_path / "optuna.journal")
+    reopened(tmp_path)
+    assert told(tmp_path) == TOLD
+
+
+def test_a_folder_in_place_of_the_journal_is_replaced(tmp_path):
+    (tmp_path / "optuna.journal").mkdir()
+    reopened(tmp_path)
+    assert told(tmp_path) == TOLD

@@ -1,0 +1,132 @@
+"""Nobody but the owner of a run reaches its Ray: listeners on loopback alone, a token that only the owner reads."""
+
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import psutil
+import pytest
+import ray
+from conftest import SMOKE
+from processes import tree
+
+from cconv.errors import ConfigError
+from cconv.study.config import load_study
+from cconv.study.private_ray import LOCK, PREFIX, private_folder
+from cconv.study.ray_pool import ray_pool
+
+LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
+NOBODY = 65534
+JOIN = """
+import os, sys
+from ray._raylet import GcsClient
+address, user = sys.argv[1], int(sys.argv[2])
+os.setgroups([]) if user != os.getuid() else None
+os.setgid(user), os.setuid(user)
+if len(sys.argv) > 3:
+    os.environ["RAY_AUTH_TOKEN_PATH"] = sys.argv[3]
+try:
+    GcsClient(address=address).internal_kv_put(b"joined", b"yes", True, b"test")
+except BaseException as error:
+    print("refused", type(error).__name__, str(error))
+else:
+    print("joined")
+"""
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    """A Ray as a study starts it: address of its control service, and the file of its token."""
+    with ray_pool(load_study(SMOKE, ["search.concurrency=1"]), None, tmp_path_factory.mktemp("ray")):
+        ray.get(ray.remote(lambda: 0).remote())  # a worker is there, and listens
+        yield ray.get_runtime_context().gcs_address, Path(os.environ["RAY_AUTH_TOKEN_PATH"])
+
+
+def join(address, *arguments, user=None, **environment):
+    """What a process of some user hears that tries to write to the running Ray."""
+    known = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    command = [sys.executable, "-c", JOIN, address, str(os.getuid() if user is None else user), *map(str, arguments)]
+    environment = known | {"HOME": "/nonexistent"} | environment
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
+    return run.stdout
+
+
+def test_everything_listens_on_loopback_alone(running):
+    processes = tree(os.getpid())
+    listeners = {
+        (process.name(), connection.laddr.ip)
+        for process in processes
+        for connection in process.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+    assert {"gcs_server", "raylet"} <= {name for name, _ in listeners}
+    assert {ip for _, ip in listeners} <= set(LOOPBACK)
+
+
+def test_only_the_owner_reads_the_token_and_no_command_line_or_environment_holds_it(running):
+    _, path = running
+    token = path.read_text()
+    assert len(token) >= 32
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    for process in tree(os.getpid()):
+        assert token not in " ".join(process.cmdline())
+        assert token not in process.environ().values()
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}],
+    ids=["no token", "a wrong one"],
+)
+def test_who_has_no_token_or_a_wrong_one_cannot_join(running, environment):
+    assert join(running[0], **environment).startswith("refused AuthenticationError")
+
+
+def test_who_has_the_token_can_join(running):
+    """Otherwise the tests beside this one would pass for another reason than the token."""
+    address, path = running
+    assert join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN_PATH=str(path)) == "joined\n"
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
+def test_another_user_can_neither_read_the_token_nor_join(running):
+    address, path = running
+    reading = subprocess.run(["cat", path], user=NOBODY, capture_output=True, text=True)
+    assert (reading.returncode != 0, reading.stdout) == (True, "")
+    assert "joined" not in join(address, path, user=NOBODY, RAY_AUTH_MODE="token")
+    assert join(address, user=NOBODY, RAY_AUTH_MODE="disabled").startswith("refused AuthenticationError")
+    assert join(address, user=NOBODY, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=path.read_text()) == "joined\n"
+
+
+def test_folders_of_killed_runs_go_and_those_in_use_stay(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr("cconv.study.private_ray.LONGEST_SOCKET", 1000)
+    left = tmp_path / f"{PREFIX}abcdefgh"
+    left.mkdir()
+    (left / LOCK).touch()
+    with private_folder() as first:
+        assert not left.exists()
+        with private_folder() as second:
+            assert first.is_dir()
+            assert first != second
+        assert not second.exists()
+    assert not first.exists()
+
+
+def test_a_long_place_for_temporary_files_is_passed_over(tmp_path, monkeypatch):
+    long = tmp_path / ("x" * 100)
+    long.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    with private_folder() as folder:
+        assert long not in folder.parents
+
+
+def test_no_place_for_temporary_files_is_one_line_that_names_the_variable(monkeypatch):
+    monkeypatch.setattr("cconv.study.private_ray.LONGEST_SOCKET", 20)
+    with pytest.raises(ConfigError, match="bytes too long.*set TMPDIR") as caught, private_folder():
+        pass
+    assert "\n" not in str(caught.value)
