@@ -22,6 +22,10 @@ class DataError(CConvError):
     """A file or folder of particle data is missing, damaged or inconsistent."""
 
 
+class StudyError(CConvError):
+    """A study whose input was right came to no result."""
+
+
 class SimulationError(CConvError):
     """A simulation did not stay finite."""
 

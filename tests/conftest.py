@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import PATIENCE
 
 from cconv.cli import main
 
@@ -72,7 +73,7 @@ def finished_run(tmp_path_factory, flow_folder):
     """Run folder of a whole study of the smallest size, in a process of its own as Ray brings many more."""
     folder = tmp_path_factory.mktemp("runs") / "smoke"
     command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert finished.returncode == 0, finished.stderr
     assert f"Report: {folder / 'report.html'}" in finished.stdout
     return folder

@@ -2,6 +2,8 @@
 
 import psutil
 
+PATIENCE = 900  # seconds for a process that works: only one that hangs takes longer, also on a busy machine
+
 
 def tree(pid):
     """A process and all that descend from it; none if it is gone."""
@@ -20,7 +22,7 @@ def kill_tree(pid):
             process.kill()
         except psutil.NoSuchProcess:
             continue
-    psutil.wait_procs(processes, timeout=10)
+    psutil.wait_procs(processes, timeout=PATIENCE)
 
 
 def names(pid):

@@ -9,6 +9,7 @@ import h5py
 import pytest
 from conftest import SCRIPT, SMOKE
 from outcomes import assert_one_clear_line
+from processes import PATIENCE
 
 from cconv import load_model
 from cconv.study.records import RunFolder
@@ -160,14 +161,14 @@ def test_what_is_no_run_or_checkpoint_is_named(cconv, tmp_path):
     assert_one_clear_line(cconv("evaluate", tmp_path), "model.safetensors")
 
 
-def interrupt(command, ready, timeout=120):
+def interrupt(command, ready, timeout=PATIENCE):
     """Start a command in a process group of its own, wait until `ready`, press Ctrl-C; gives its exit status."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
     deadline = time.monotonic() + timeout
     while not ready() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.2)
     os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=PATIENCE)
     return process.returncode, error.decode()
 
 
@@ -238,3 +239,18 @@ def test_a_space_whose_baseline_is_too_expensive_is_refused(cconv, flow_folder, 
     outcome = cconv("study", "run", SMOKE, "--data", flow_folder, *settings, "--out", tmp_path / "run")
     assert_one_clear_line(outcome, "its baseline costs", "raise the cap")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_study_all_of_whose_finalists_failed_ends_in_status_1_with_the_reason(cconv, finished_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(finished_run, folder)
+    for stage in ("finalists", "ablation", "select"):
+        (folder / "stages" / f"{stage}.json").unlink()
+    for outcome in folder.glob("finalists/*/*/outcome.json"):
+        outcome.write_text(json.dumps({"outcome": "failed", "reason": "out of memory"}))
+    status, _, error = cconv("study", "resume", folder)
+    assert status == 1
+    last = error.splitlines()[-1]
+    assert last.startswith(f"cconv: {folder}: no finalist finished its training (")
+    assert "out of memory" in last
+    assert json.loads((folder / "state.json").read_text()) == {"state": "failed", "stage": "finalists"}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from nbclient import NotebookClient
+from processes import PATIENCE
 from summaries import explanation, whole_summary
 
 from cconv.study.records import RunFolder
@@ -21,7 +22,7 @@ def execute(path):
     """Outputs of a notebook and the large packages that it loaded."""
     notebook = nbformat.read(path, as_version=4)
     notebook.cells.append(nbformat.v4.new_code_cell(LOADED))
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(ANALYSIS)}}).execute()
+    NotebookClient(notebook, timeout=PATIENCE, resources={"metadata": {"path": str(ANALYSIS)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     return outputs[:-1], outputs[-1]["text"].strip()
 

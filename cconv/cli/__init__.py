@@ -8,7 +8,7 @@ from cconv.cli.console import errors
 from cconv.cli.data import app as data_app
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.study import app as study_app
-from cconv.errors import CConvError, is_disk_full
+from cconv.errors import CConvError, StudyError, is_disk_full
 
 INTERRUPTED = 130
 
@@ -26,16 +26,16 @@ for command in (train, fit, evaluate, report):
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one line on stderr and exit status 2."""
+    """Run the command line; bad input ends in one line on stderr and exit status 2, a study without a result in 1."""
     try:
         app()
     except CConvError as error:
         errors.print(f"cconv: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
-        sys.exit(2)
+        sys.exit(1 if isinstance(error, StudyError) else 2)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         remedy = "; make room, then `cconv study resume` goes on" if is_disk_full(error) else ""
-        line = f"cconv: {place}{error.strerror}{remedy}"
+        line = f"cconv: {place}{error.strerror or str(error) or type(error).__name__}{remedy}"
         errors.print(line, style="bold red", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:

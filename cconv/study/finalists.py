@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cconv.data.targets import Sample
+from cconv.errors import StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.metrics import (
     blocks_of_errors,
@@ -71,6 +72,9 @@ def retrain_finalists(session: Session, stage: str) -> dict:
 
     Returns:
         "finalists": the hyperparameters of each, by id.
+
+    Raises:
+        StudyError: If none of them finished its training.
     """
     study, settings = session.study, session.study.stages[stage]
     first_seed = study.seeds.init + 1
@@ -80,7 +84,16 @@ def retrain_finalists(session: Session, stage: str) -> dict:
     trained = [Finalist(id=name, parameters=parameters) for name, parameters in (named | searched).items()]
     jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
     train_all(session, FINALISTS, jobs, finalist_training(study))
-    return {"finalists": named | searched | closed}
+    finalists = named | searched | closed
+    check_any_finished(session.run, *retrained_finalists(session.run, finalists, study.finalists.seeds))
+    return {"finalists": finalists}
+
+
+def check_any_finished(run: RunFolder, finished: Sequence[Retrained], failed: Mapping[str, str]) -> None:
+    """Raise `StudyError` with what became of each finalist unless one of them finished its training."""
+    if not finished:
+        ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
+        raise StudyError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
 
 
 def best_trials(session: Session, stage: str) -> list[TrialRecord]:

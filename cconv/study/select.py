@@ -11,13 +11,19 @@ import numpy as np
 from cconv.data.features import fluid_state
 from cconv.data.splits import evenly_spaced
 from cconv.data.targets import TASKS, Sample
-from cconv.errors import ConfigError
 from cconv.evaluation.cost import Cost, measure_analytic, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.evaluation.stability import measure_stability
 from cconv.sph.kernels import kernel_named
 from cconv.study.costs import points_of_search
-from cconv.study.finalists import Retrained, complete_cards, evaluate_finalist, finalist_entry, retrained_finalists
+from cconv.study.finalists import (
+    Retrained,
+    check_any_finished,
+    complete_cards,
+    evaluate_finalist,
+    finalist_entry,
+    retrained_finalists,
+)
 from cconv.study.front import attainment, bootstrap_hypervolume
 from cconv.study.problem import study_samples
 from cconv.study.records import RunFolder, count_outcomes
@@ -34,14 +40,12 @@ def select(session: Session, stage: str) -> dict:
     """Test, time and stress the finalists, recommend one, write summary.json.
 
     Raises:
-        ConfigError: If no finalist could be retrained.
+        StudyError: If no finalist could be retrained.
     """
     start = time.perf_counter()
     study, run = session.study, session.run
     finalists, failed = _finalists(session, stage)
-    if not finalists:
-        ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
-        raise ConfigError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
+    check_any_finished(run, finalists, failed)
     samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
     tests, errors = _test(session, finalists, samples)
     timed = _time(session, finalists)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import PATIENCE
 from safetensors import SafetensorError
 
 from cconv.data import generate as module
@@ -190,7 +191,7 @@ def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     running.wait()
     kept = list(unfinished.glob("*.safetensors"))
     assert 2 <= len(kept) < 6
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert finished.returncode == 0, finished.stderr
     assert f"6 trajectories, {len(kept)} of them from an earlier run" in finished.stdout
     assert len(open_dataset(tmp_path / "a").splits["train"]) == 2
@@ -259,7 +260,7 @@ def test_workers_end_with_their_parent_and_at_an_interrupt(tmp_path):
         time.sleep(2)
         children = _children(running.pid)
         running.send_signal(told)
-        running.wait(timeout=20)
+        running.wait(timeout=PATIENCE)
         deadline = time.monotonic() + 20
         while any(Path(f"/proc/{child}/cmdline").exists() for child in children) and time.monotonic() < deadline:
             time.sleep(0.05)

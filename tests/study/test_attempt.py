@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from processes import PATIENCE
 
 from cconv.study.attempt import Attempt, Hanging, Superseded
 
@@ -40,6 +41,6 @@ def test_a_superseded_attempt_leaves_its_successor_in_place_when_it_ends(tmp_pat
 
 
 def test_a_process_that_hangs_is_ended_and_no_attempt_follows(tmp_path):
-    assert subprocess.run([sys.executable, "-c", HANG, tmp_path], timeout=60).returncode != 0
+    assert subprocess.run([sys.executable, "-c", HANG, tmp_path], timeout=PATIENCE).returncode != 0
     with pytest.raises(Hanging, match=r"hung and was ended after 0\.2 seconds"), Attempt(tmp_path, 0.2):
         pass

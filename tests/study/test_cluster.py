@@ -14,7 +14,7 @@ import optuna
 import pytest
 from conftest import SCRIPT
 from outcomes import assert_one_clear_line
-from processes import kill_tree, names
+from processes import PATIENCE, kill_tree, names
 from studies import write_search
 
 from cconv.study.optuna_mirror import open_storage
@@ -72,7 +72,7 @@ def free_port():
         return free.getsockname()[1]
 
 
-def wait_until(holds, *processes, said=None, timeout=90):
+def wait_until(holds, *processes, said=None, timeout=PATIENCE):
     deadline = time.monotonic() + timeout
     while not holds():
         assert all(process.poll() is None for process in processes), said and said.read_text()
@@ -98,7 +98,6 @@ def started(command):
         process.communicate()
 
 
-@pytest.mark.timeout(300)
 def test_a_study_survives_the_death_of_a_node_without_losing_a_trial(nodes, study_file, flow_folder, tmp_path):
     address, second = nodes
     folder = tmp_path / "run"
@@ -107,7 +106,7 @@ def test_a_study_survives_the_death_of_a_node_without_losing_a_trial(nodes, stud
         wait_until(lambda: sum(map(len, logs(folder).values())) >= 8 and is_training(second), study, second)
         before = logs(folder)
         kill_tree(second.pid)
-        _, errors = study.communicate(timeout=150)
+        _, errors = study.communicate(timeout=PATIENCE)
     assert study.returncode == 0, errors
     assert_whole(folder)
     after = logs(folder)
@@ -147,7 +146,7 @@ def test_a_cluster_whose_token_one_lacks_is_one_line(nodes, token, given, said, 
     folder = tmp_path / "run"
     command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", address]
     environment = os.environ | {"HOME": str(tmp_path)}
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
     last = run.stderr.splitlines(keepends=True)[-1]
     assert_one_clear_line((run.returncode, run.stdout, last), f"--address {address}", said)
     assert not folder.exists()
@@ -156,7 +155,7 @@ def test_a_cluster_whose_token_one_lacks_is_one_line(nodes, token, given, said, 
 def test_a_cluster_that_is_not_there_is_one_line_and_the_same_command_works_later(study_file, flow_folder, tmp_path):
     folder = tmp_path / "run"
     command = [SCRIPT, "study", "run", study_file, "--data", flow_folder, "--out", folder, "--address", "127.0.0.1:1"]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     last = run.stderr.splitlines(keepends=True)[-1]
     assert_one_clear_line((run.returncode, run.stdout, last), "--address 127.0.0.1:1", "ray start --head")
     assert not folder.exists()

@@ -6,6 +6,7 @@ import subprocess
 import optuna
 import pytest
 from conftest import SCRIPT
+from processes import PATIENCE
 
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
@@ -203,7 +204,7 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp
     (tmp_path / "failures.toml").write_text(STUDY_WITH_FAILURES.format(space=tmp_path / "space.toml"))
     folder = tmp_path / "run"
     command = [SCRIPT, "study", "run", tmp_path / "failures.toml", "--data", flow_folder, "--out", folder]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert finished.returncode == 0, finished.stderr
     run = RunFolder.open(folder)
     failed = [record for record in run.trials() if record.outcome == "failed"]
@@ -214,7 +215,7 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp
     assert [entry["id"] for entry in run.read("summary.json")["finalists"]] == ["baseline"]
     before = {record.id: record.log for record in run.trials()}
     command = [SCRIPT, "study", "extend", folder, "--stage", "random", "--trials", "3"]
-    extended = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    extended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert extended.returncode == 0, extended.stderr
     after = {record.id: record.log for record in run.trials()}
     assert len(after) == 9

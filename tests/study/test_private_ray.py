@@ -11,7 +11,7 @@ import psutil
 import pytest
 import ray
 from conftest import SMOKE
-from processes import tree
+from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
 from cconv.study.config import load_study
@@ -50,7 +50,7 @@ def join(address, *arguments, user=None, **environment):
     known = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     command = [sys.executable, "-c", JOIN, address, str(os.getuid() if user is None else user), *map(str, arguments)]
     environment = known | {"HOME": "/nonexistent"} | environment
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE)
     return run.stdout
 
 
