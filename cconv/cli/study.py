@@ -146,6 +146,8 @@ def _run_stages(folder: "RunFolder", address: str | None, storage: str | None) -
     if summary is not None:
         results.print(_finalists_table(summary))
         results.print(summary["recommended"]["reason"], highlight=False)
+        if summary["budget"]:
+            results.print(summary["budget"], highlight=False)
         results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes.", highlight=False)
     results.print(f"Report: {report}", soft_wrap=True)
 

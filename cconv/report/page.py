@@ -16,6 +16,7 @@ from cconv.report.interactive import interactive_html
 from cconv.report.plots import (
     ablation_chart,
     best_so_far_chart,
+    budget_chart,
     growth_chart,
     learning_curves_chart,
     rung_audit_chart,
@@ -83,6 +84,7 @@ def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
         "comparison": _comparison(summary),
         "chart": interactive_html(summary),
         "charts": {name: _picture(draw(summary)) for name, draw in _CHARTS.items() if summary.get(name)}
+        | {"budget": _picture(budget_chart(curves_table(run), [entry["id"] for entry in summary["finalists"]]))}
         | ({"ablation": _picture(ablation_chart(summary))} if summary.get("ablation", {}).get("path") else {}),
         "finalists": _finalists_rows(summary),
         "stability": verdict_matrix(summary),

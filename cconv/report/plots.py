@@ -1,6 +1,6 @@
 """Charts of a study. Each function returns a matplotlib figure of its own; showing or saving it is the caller's."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 import seaborn as sns
@@ -18,7 +18,7 @@ _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides
 def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> Figure:
     """Validation error against gradient updates, one line a search trial, and one for each retraining beside them."""
     figure, (search, finals) = new_figure(11, 4.2, columns=2)
-    trials, retrained = curves[curves["stage"] != "finalists"], curves[curves["stage"] == "finalists"]
+    trials, retrained = curves[~curves["retrained"]], curves[curves["stage"] == "finalists"]
     stages = stage_colors(list(trials["stage"].unique()))
     for (_, stage), curve in trials.groupby(["name", "stage"]):
         style = {"color": stages[stage], "alpha": 0.6, "marker": ".", "lw": 1}
@@ -35,6 +35,31 @@ def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> F
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
         axes.set(yscale="log", xlabel="gradient updates", ylabel=_ERROR, title=title)
         _legend(axes)
+    return figure
+
+
+def budget_chart(curves: pd.DataFrame, finalists: Sequence[str]) -> Figure:
+    """Validation error of every training of the finalists against gradient updates, and against training seconds.
+
+    Args:
+        curves: Evaluations as `curves_table` gives them.
+        finalists: Ids of the finalists, each of which has a colour.
+    """
+    figure, panels = new_figure(12, 4.4, columns=2)
+    is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_normalized_mse"].notna()
+    shown = curves[is_shown]
+    colors = dict(zip(finalists, sns.color_palette("husl", len(finalists)), strict=True))
+    for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
+        for name, lines in shown.groupby("name", sort=False):
+            for number, (_, curve) in enumerate(lines.groupby("seed")):
+                style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
+                axes.plot(curve[x], curve["valid_normalized_mse"], marker="." if len(curve) == 1 else "", **style)
+        axes.set(yscale="log", xlabel=label, ylabel=_ERROR)
+    trained = shown["updates"][shown["updates"] > 0]
+    panels[0].set_xscale("symlog", linthresh=trained.min() if len(trained) else 1)  # least squares takes no update
+    panels[0].set(title="error against updates, one line a seed", xlim=(0, None))
+    panels[1].set(title="error against time", xscale="log")
+    _legend(panels[1], **_BESIDE)
     return figure
 
 

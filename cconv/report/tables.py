@@ -29,16 +29,21 @@ def trials_table(run: RunFolder) -> pd.DataFrame:
 
 
 def curves_table(run: RunFolder) -> pd.DataFrame:
-    """One row an evaluation of a search trial or retraining: name, stage, seed, updates, errors."""
+    """One row an evaluation of a search trial or retraining: name, stage, retrained, seed, updates, seconds, errors.
+
+    The column "retrained" tells the trainings of finalists and ablations from trials of a search.
+    """
+    records = [(record.id, False, record) for record in run.trials()]
+    records += [(name, True, record) for name, trained in run.retrainings().items() for record in trained]
     rows = [
-        {"name": record.id, "stage": record.stage, "seed": record.config["init_seed"], **entry}
-        for record in run.trials()
-        for entry in record.log
-    ]
-    rows += [
-        {"name": finalist, "stage": record.stage, "seed": record.config["init_seed"], **entry}
-        for finalist, records in run.retrainings().items()
-        for record in records
+        {
+            "name": name,
+            "stage": record.stage,
+            "retrained": retrained,
+            "seed": record.config["init_seed"],
+            **entry,
+        }
+        for name, retrained, record in records
         for entry in record.log
     ]
     return pd.DataFrame(rows)

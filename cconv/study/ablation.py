@@ -12,9 +12,9 @@ from cconv.study.ablation_path import ablation_order, path_configurations
 from cconv.study.closed_form import BRANCHES, fit_whole
 from cconv.study.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
 from cconv.study.search import train_all
-from cconv.study.session import BASELINE, Session
+from cconv.study.session import Session
 from cconv.study.space import configure
-from cconv.study.stages import reads_of
+from cconv.study.stages import BASELINE, reads_of
 from cconv.study.surrogate import FEWEST_TRIALS
 
 

@@ -17,12 +17,14 @@ from cconv.evaluation.metrics import (
     normalized_mse,
     per_frame_normalized_mse,
 )
+from cconv.study.budget import fall_at_the_end
 from cconv.study.closed_form import fit_closed_form_finalists
 from cconv.study.config import StudyConfig, TrainingConfig
 from cconv.study.records import RunFolder, TrialRecord
 from cconv.study.search import train_all
 from cconv.study.selection import choose_finalists
-from cconv.study.session import BASELINE, Session
+from cconv.study.session import Session
+from cconv.study.stages import BASELINE
 from cconv.study.trial_queue import Job, job_in
 from cconv.training.checkpoint import load_model, read_card, save_model
 
@@ -177,6 +179,8 @@ def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, stability: Ma
         "id": finalist.id,
         "config": {"network": config["network"], "training": config["training"], "parameters": config["parameters"]},
         "num_parameters": config["num_parameters"],
+        "updates": config["training"]["updates"],
+        "fall_at_the_end": fall_at_the_end(finalist.records),
         "valid": {"normalized_mse": float(np.mean(finalist.valid_errors))},
         "test": dict(test),
         "cost": asdict(cost),

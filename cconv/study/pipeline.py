@@ -10,6 +10,7 @@ from cconv.study.ablation import ablate
 from cconv.study.baseline import train_baseline
 from cconv.study.closed_form import screen_closed_forms
 from cconv.study.config import StudyConfig
+from cconv.study.convergence import train_longer
 from cconv.study.costs import CostCounter
 from cconv.study.environment import describe_environment
 from cconv.study.finalists import retrain_finalists
@@ -38,6 +39,7 @@ STAGES: Mapping[str, Callable[[Session, str], dict]] = {
     "adaptive": adaptive_search,
     "finalists": retrain_finalists,
     "ablation": ablate,
+    "converge": train_longer,
     "select": select,
 }
 

@@ -268,7 +268,7 @@ class _Silent(tune.ProgressReporter):
 def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem) -> None:
     """Train a job; every evaluation is reported, then how it ended if the training itself knows."""
     torch.set_num_threads(1)
-    limit = study.search.trial_seconds
+    limit = _seconds_limit(study, training)
     last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
     outcome, reason = None, ""
     try:
@@ -282,6 +282,11 @@ def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: Stu
     if outcome is not None:
         _record_what_failed(job, stage, outcome)
         tune.report(last | {"outcome": outcome, "reason": reason})
+
+
+def _seconds_limit(study: StudyConfig, training: TrainingConfig) -> float:
+    """Time that a training may take: the limit of a trial, and more in proportion for a budget beyond a trial's."""
+    return study.search.trial_seconds * max(1.0, training.updates / study.training.updates)
 
 
 def _trial(
@@ -303,7 +308,7 @@ def _trial(
         init_seed=job.init_seed,
         data_seed=study.seeds.data,
         provenance=provenance(study),
-        seconds_limit=study.search.trial_seconds,
+        seconds_limit=_seconds_limit(study, training),
         on_update=check_before_writing,
     )
 

@@ -15,6 +15,7 @@ from cconv.evaluation.cost import Cost, measure_analytic, measure_costs, measure
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.evaluation.stability import measure_stability
 from cconv.sph.kernels import kernel_named
+from cconv.study.budget import budget_words
 from cconv.study.costs import points_of_search
 from cconv.study.finalists import (
     Retrained,
@@ -28,8 +29,8 @@ from cconv.study.front import attainment, bootstrap_hypervolume
 from cconv.study.problem import study_samples
 from cconv.study.records import RunFolder, count_outcomes
 from cconv.study.selection import Recommendation, pareto_front, recommend
-from cconv.study.session import BASELINE, Session
-from cconv.study.stages import reads_of
+from cconv.study.session import Session
+from cconv.study.stages import BASELINE, reads_of
 from cconv.training.checkpoint import load_model
 
 TIMED_FRAMES = 5
@@ -63,14 +64,15 @@ def select(session: Session, stage: str) -> dict:
     for finalist in finalists:
         complete_cards(finalist, tests[finalist.id], environment)
     milliseconds = {name: cost.ms_per_frame for name, cost in costs.items()}
+    entries = [finalist_entry(each, tests[each.id], costs[each.id], stability[each.id], run) for each in finalists]
+    found = _of_earlier_stages(session, stage)
     summary = {
         "study": study.name,
         "task": study.task,
         "dataset": _dataset(session, samples),
         "baseline": BASELINE,
-        "finalists": [
-            finalist_entry(each, tests[each.id], costs[each.id], stability[each.id], run) for each in finalists
-        ],
+        "finalists": entries,
+        "budget": budget_words(entries, found.get("convergence", {}), study.selection.margin),
         "failed_finalists": failed,
         "pareto_front": pareto_front({name: (tests[name]["normalized_mse"], milliseconds[name]) for name in tests}),
         "front": _front(errors, milliseconds),
@@ -80,7 +82,7 @@ def select(session: Session, stage: str) -> dict:
         "analytic": _analytic(session),
         "growth": _growth(session, finalists),
         "trials": _counts(run),
-        **_of_earlier_stages(session, stage),
+        **found,
         "wall_seconds": _seconds_before(session, stage) + time.perf_counter() - start,
     }
     run.write("summary.json", summary)

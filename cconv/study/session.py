@@ -13,8 +13,6 @@ from cconv.study.records import RunFolder, TrialRecord
 from cconv.study.space import SearchSpace, load_space
 from cconv.study.stages import reads_of
 
-BASELINE = "baseline"
-
 Progress = Callable[[Iterable, str], Iterable]
 
 

@@ -3,10 +3,12 @@
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from cconv.errors import did_you_mean
 from cconv.validation import StrictModel, Value
+
+BASELINE = "baseline"  # id of the published network among the finalists
 
 
 class _Stage(StrictModel):
@@ -99,6 +101,24 @@ class AblationStage(_Stage):
     seeds: int = Field(1, ge=1)
 
 
+class ConvergeStage(_Stage):
+    """Trains finalists with each of `budgets` (gradient updates, ascending) until more no longer lowers the error.
+
+    `of` names the baseline or configurations that a stage of finalists includes; None means every trained finalist.
+    """
+
+    kind: Literal["converge"]
+    budgets: tuple[Annotated[int, Field(ge=1, le=10_000_000)], ...] = Field(min_length=1, max_length=20)
+    of: tuple[str, ...] | None = None
+
+    @field_validator("budgets")
+    @classmethod
+    def _budgets_ascend(cls, budgets: tuple[int, ...]) -> tuple[int, ...]:
+        if list(budgets) != sorted(set(budgets)):
+            raise ValueError("budgets must ascend")
+        return budgets
+
+
 class SelectStage(_Stage):
     """Tests, times and stresses the finalists and recommends one."""
 
@@ -116,6 +136,7 @@ Stage = Annotated[
     | ImportanceStage
     | FinalistsStage
     | AblationStage
+    | ConvergeStage
     | SelectStage,
     Field(discriminator="kind"),
 ]
@@ -132,9 +153,18 @@ USES = {
     "adaptive": ("baseline", "initialization", "random"),
     "finalists": ("closed_form", "random", "adaptive"),
     "ablation": ("initialization", "random", "finalists"),
-    "select": ("finalists",),
+    "converge": ("finalists",),
+    "select": ("finalists", "converge"),
 }
-NEEDS = {"reference", "refine", "importance", "finalists", "ablation", "select"}  # idle without a stage to read
+NEEDS = {
+    "reference",
+    "refine",
+    "importance",
+    "finalists",
+    "ablation",
+    "converge",
+    "select",
+}  # idle without a stage to read
 
 
 def default_stages() -> dict[str, StrictModel]:
@@ -184,5 +214,15 @@ def check_order(stages: Mapping[str, StrictModel]) -> None:
                 raise ValueError(f"stage `{name}` cannot use the records of `{other}`; kinds that it can use: {uses}")
         if space and stages[space].kind != "refine":
             raise ValueError(f"stage `{name}` takes its space from `{space}`, which is no stage of kind refine")
+        _check_named_finalists(stages, name)
         if stage.kind in NEEDS and not reads_of(stages, name):
             raise ValueError(f"stage `{name}` has nothing to read; put one of {', '.join(USES[stage.kind])} before it")
+
+
+def _check_named_finalists(stages: Mapping[str, StrictModel], name: str) -> None:
+    """Check that a stage which names finalists names some that are sure to be there."""
+    included = [each for other in reads_of(stages, name) for each in getattr(stages[other], "include", ())]
+    for finalist in getattr(stages[name], "of", None) or ():
+        if finalist not in (BASELINE, *included):
+            known = ", ".join((BASELINE, *included))
+            raise ValueError(f"stage `{name}` names the finalist `{finalist}`; it can name {known}")

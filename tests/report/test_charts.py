@@ -15,6 +15,7 @@ from cconv.report.interactive import interactive_chart, interactive_html
 from cconv.report.plots import (
     ablation_chart,
     best_so_far_chart,
+    budget_chart,
     cost_chart,
     growth_chart,
     learning_curves_chart,
@@ -121,9 +122,18 @@ def test_interactive_html_holds_its_program_once(summary):
 
 def test_charts_of_the_search_show_the_trials(run):
     search, finals = learning_curves_chart(curves_table(run)).axes
-    assert len(search.lines) >= len(run.trials())
+    stages = {record.stage for record in run.trials()}
+    assert len(search.lines) == len(run.trials()) + len(stages)  # and a line of each stage for the legend
     assert len(finals.lines) == sum(len(records) for records in run.retrainings().values())
     assert best_so_far_chart(trials_table(run)).axes[0].get_yscale() == "log"
+
+
+def test_the_chart_of_budgets_has_a_line_for_each_seed_of_each_finalist(run, summary):
+    ids = [entry["id"] for entry in summary["finalists"]]
+    updates, seconds = budget_chart(curves_table(run), ids).axes
+    trained = sum(len(records) for name, records in run.retrainings().items() if name in ids)
+    assert len(updates.lines) == len(seconds.lines) == trained
+    assert [text.get_text() for text in seconds.get_legend().get_texts()] == sorted(ids)
 
 
 def test_other_charts_show_their_records(summary):

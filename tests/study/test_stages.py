@@ -56,3 +56,17 @@ def test_the_default_stages_read_earlier_ones():
 def test_what_does_not_fit_is_named(stages, message):
     with pytest.raises(ConfigError, match=message):
         study(**stages)
+
+
+def test_a_stage_that_converges_names_finalists_that_are_sure_to_be_there():
+    stages = {"random": {}, "finalists": {"include": {"named": {"layers": 1}}}}
+    named = study(**stages, converge={"budgets": [10, 20], "of": ["baseline", "named"]}, select={}).stages
+    assert reads_of(named, "select") == ["finalists", "converge"]
+    with pytest.raises(ConfigError, match="names the finalist `random_0001`; it can name baseline, named"):
+        study(**stages, converge={"budgets": [10], "of": ["random_0001"]})
+
+
+@pytest.mark.parametrize("budgets", [[20, 10], [10, 10], [], [0, 5]])
+def test_budgets_ascend(budgets):
+    with pytest.raises(ConfigError, match="budgets"):
+        study(random={}, finalists={}, converge={"budgets": budgets})
