@@ -67,7 +67,7 @@ def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
 
 
 def test_a_training_that_diverges_says_so(cconv, flow_folder, tmp_path):
-    settings = ["--set", "training.learning_rate=1e30"]
+    settings = ["--set", "training.learning_rate=1e3", "--set", "network.layers=12"]
     status, _, error = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *settings)
     assert status == 1
     assert "Diverged" in error
