@@ -5,7 +5,8 @@ import re
 import stat
 import tomllib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from cconv.errors import CConvError, ConfigError, DataError, shown
@@ -47,12 +48,11 @@ def read_text(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvEr
 
 def read_json(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvError] = DataError):
     """Content of a JSON file; arguments and errors as of `read_text`."""
+    text = read_text(path, largest, error)
     try:
-        return parse_json(read_text(path, largest, error))
-    except (ValueError, RecursionError) as problem:
-        if isinstance(problem, CConvError):
-            raise
-        raise error(f"{path}: not JSON ({_reason(problem)}); restore the file or make it again.") from problem
+        return parse_json(text)
+    except ValueError as problem:
+        raise error(f"{path}: not JSON ({problem}); restore the file or make it again.") from problem
 
 
 def parse_json(text: str):
@@ -60,9 +60,8 @@ def parse_json(text: str):
 
     Raises:
         ValueError: If it is none.
-        RecursionError: If it is far too deep.
     """
-    return _not_too_deep(json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats))
+    return _parsed(text, partial(json.loads, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats))
 
 
 def read_toml(path: Path | str) -> dict:
@@ -71,12 +70,11 @@ def read_toml(path: Path | str) -> dict:
     Raises:
         ConfigError: If the file cannot be read or is not TOML.
     """
+    text = read_text(path, LARGEST_SETTINGS, ConfigError)
     try:
-        return parse_toml(read_text(path, LARGEST_SETTINGS, ConfigError))
-    except (ValueError, RecursionError) as problem:
-        if isinstance(problem, CConvError):
-            raise
-        raise ConfigError(f"{path}: not a TOML file ({_reason(problem)}); mend that line.") from problem
+        return parse_toml(text)
+    except ValueError as problem:
+        raise ConfigError(f"{path}: not a TOML file ({problem}); mend that line.") from problem
 
 
 def parse_toml(text: str) -> dict:
@@ -84,17 +82,23 @@ def parse_toml(text: str) -> dict:
 
     Raises:
         ValueError: If it is none.
-        RecursionError: If it is far too deep.
     """
     if _LONG_KEY.search(text):  # tomllib takes memory that grows with the square of their length
         raise ValueError(f"a key has more than {DEEPEST} parts")
-    return _not_too_deep(tomllib.loads(text))
+    return _parsed(text, tomllib.loads)
 
 
-def _reason(problem: Exception) -> str:
-    if isinstance(problem, RecursionError):
-        return f"more than {DEEPEST} tables or arrays inside each other"
-    return str(problem)
+def _parsed(text: str, parse: Callable[[str], object]):
+    """What `parse` makes of a text, unless it is too deep."""
+    try:
+        value = parse(text)
+    except RecursionError:
+        depth = DEEPEST + 1
+    else:
+        depth = _depth(value)
+    if depth > DEEPEST:
+        raise ValueError(f"more than {DEEPEST} tables or arrays inside each other")
+    return value
 
 
 def _refuse_constant(name: str):
@@ -109,12 +113,10 @@ def _without_repeats(pairs: list[tuple]) -> dict:
     return table
 
 
-def _not_too_deep(value):
-    """The value, unless it is too deep; level by level, as Python's own stack ends at some hundred."""
-    level = [value] if isinstance(value, Mapping | list) else []
-    for _ in range(DEEPEST + 1):
-        if not level:
-            return value
-        nested = (each.values() if isinstance(each, Mapping) else each for each in level)
-        level = [inner for each in nested for inner in each if isinstance(inner, Mapping | list)]
-    raise RecursionError
+def _depth(value: object) -> int:
+    """Tables and arrays inside each other; level by level, as Python's own stack ends at some hundred."""
+    depth, level = 0, [value]
+    while level := [each for each in level if isinstance(each, dict | list)]:
+        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
+        depth += 1
+    return depth

@@ -112,14 +112,14 @@ def check_setting(annotation: object, value: object, name: str) -> None:
 def _describe(model: type[BaseModel], values: object, problem: Mapping) -> str:
     location = [part for part in problem["loc"] if part != "[key]"]
     written = _written_path(values, location, problem["type"] == "missing")
-    key = ".".join(str(part)[:80] for part in written) or "the file"
+    key = ".".join(str(part)[:80] for part in written)
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model, location[:-1])
         listed = f" Known: {', '.join(known)}." if known else ""
         return f"unknown key `{key}`.{did_you_mean(location[-1], known)}{listed}"
     if problem["type"] == "missing":
         return f"`{key}` is missing; add it."
-    return f"`{key}`: {_sentence(problem)}"
+    return f"`{key}`: {_sentence(problem)}" if key else _sentence(problem)
 
 
 def _sentence(problem: Mapping) -> str:

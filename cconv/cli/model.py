@@ -143,10 +143,26 @@ def evaluate(
 
 def report(path: RunPath) -> None:
     """Write report.html of a run again, also of one that was interrupted."""
-    from cconv.report.page import write_report
-    from cconv.study.records import RunFolder
+    from jinja2 import TemplateError
 
-    results.print(f"Report: {write_report(RunFolder.open(path))}", soft_wrap=True)
+    from cconv.report.page import write_report
+    from cconv.study.config import recorded_study
+    from cconv.study.records import RunFolder
+    from cconv.study.space import recorded_space
+
+    run = RunFolder.open(path)
+    recorded_study(run), recorded_space(run)  # whose every key the page may show
+    try:
+        written = write_report(run)
+    except CConvError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, TemplateError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise DataError(
+            f"{path}: summary.json or another record lacks what the report shows, or holds something else there "
+            f"({reason}); restore it, or run the study again."
+        ) from error
+    results.print(f"Report: {written}", soft_wrap=True)
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:

@@ -213,7 +213,7 @@ def configure(
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"])) or "together"
-        raise ConfigError(f"not possible ({where}: {problem['msg']})") from error
+        raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
@@ -270,5 +270,5 @@ def _value(text: str, setting: str) -> object:
         return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{setting}: no value for a setting ({error or 'nested too deep'}).") from error
+    except ValueError as error:
+        raise ConfigError(f"{setting}: no value for a setting ({error}).") from error

@@ -278,7 +278,7 @@ class TrialFolder:
     def _entry(path: Path, number: int, line: str) -> dict:
         try:
             entry = parse_json(line)
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             raise DataError(f"{path}: line {number} is no evaluation's record ({error}); delete that line.") from error
         validated(_Entry, entry, f"{path}: line {number} is no evaluation's record; delete that line", DataError)
         return entry
@@ -293,15 +293,12 @@ class TrialFolder:
         end = {"outcome": "interrupted", "reason": ""}
         if self.ended:
             end = read_record(self.path / "outcome.json", _Outcome)
-        log = self.log()
-        if log and None in (config["num_parameters"], config["flops_per_particle"]):
-            raise DataError(f"{self.path}: config.json lacks `num_parameters` or `flops_per_particle`; restore it.")
         return TrialRecord(
             id=self.path.name,
             stage=config["stage"],
             parameters=config["parameters"],
             config=config,
-            log=log,
+            log=self.log(),
             outcome=end["outcome"],
             reason=end["reason"],
         )
@@ -393,10 +390,16 @@ class RunFolder:
         folders = [self.trial(trial) for _, trial in numbered]
         records = [folder.read() for folder in folders if folder.started]
         for record in records:
-            if record.stage != stage:
-                path = self.trial(record.id).path / "config.json"
-                raise DataError(f"{path}: `stage` must be {stage!r}, got {shown(record.stage)}; restore the file.")
+            self._check_trial(record, stage)
         return records
+
+    def _check_trial(self, record: TrialRecord, stage: str) -> None:
+        path = self.trial(record.id).path / "config.json"
+        if record.stage != stage:
+            raise DataError(f"{path}: `stage` must be {stage!r}, got {shown(record.stage)}; restore the file.")
+        for name in ("num_parameters", "flops_per_particle"):  # None where it failed before it began
+            if record.log and record.config[name] is None:
+                raise DataError(f"{path}: `{name}` is missing, though the trial was evaluated; restore the file.")
 
     def has_result(self, stage: str) -> bool:
         """Whether a stage has come to its end."""
