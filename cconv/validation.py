@@ -19,7 +19,7 @@ from pydantic import (
     ValidationError,
 )
 
-from cconv.errors import CConvError, ConfigError, did_you_mean, shown
+from cconv.errors import CConvError, ConfigError, did_you_mean, shown, visible
 
 
 class StrictModel(BaseModel):
@@ -112,7 +112,7 @@ def check_setting(annotation: object, value: object, name: str) -> None:
 def _describe(model: type[BaseModel], values: object, problem: Mapping) -> str:
     location = [part for part in problem["loc"] if part != "[key]"]
     written = _written_path(values, location, problem["type"] == "missing")
-    key = ".".join(str(part)[:80] for part in written)
+    key = ".".join(visible(str(part)[:80]) for part in written)
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model, location[:-1])
         listed = f" Known: {', '.join(known)}." if known else ""

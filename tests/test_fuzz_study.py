@@ -101,14 +101,18 @@ def changed_bytes(draw, content):
     return content[:start] + piece + content[stop:]
 
 
+def changed_text(text, document, write):
+    """Three times in four a changed document, written again; else changed bytes."""
+    written = changed(document).map(lambda document: write(document).encode(errors="surrogatepass"))
+    return st.integers(0, 3).flatmap(lambda number: written if number else changed_bytes(text.encode()))
+
+
 def changed_toml(text):
-    return changed(tomllib.loads(text)).map(lambda document: tomli_w.dumps(document).encode(errors="surrogatepass")) | (
-        changed_bytes(text.encode())
-    )
+    return changed_text(text, tomllib.loads(text), tomli_w.dumps)
 
 
 def changed_json(text):
-    return changed(json.loads(text)).map(lambda document: json.dumps(document).encode()) | changed_bytes(text.encode())
+    return changed_text(text, json.loads(text), json.dumps)
 
 
 @st.composite
@@ -229,8 +233,11 @@ def changed_record(data, folder):
     """Change a record of a folder."""
     name = data.draw(st.sampled_from([name for name in RECORDS if (folder / name).is_file()]))
     text = (folder / name).read_text()
-    whole = name != "log.jsonl" and not name.endswith(".jsonl")
-    return name, data.draw(changed_json(text) if whole else changed_bytes(text.encode()))
+    if not name.endswith(".jsonl"):
+        return name, data.draw(changed_json(text))
+    first, *others = text.splitlines()
+    changed_line = changed_json(first).map(lambda line: b"\n".join([line, *map(str.encode, others), b""]))
+    return name, data.draw(changed_line)
 
 
 def try_record(material, data, commands=COMMANDS):
