@@ -79,9 +79,7 @@ Value = Annotated[bool | int | float | str, PlainValidator(_check_value)]  # of 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validated(
-    model: type[Model], values: object, source: Path | str, error: type[CConvError] = ConfigError
-) -> Model:
+def validated(model: type[Model], values: object, source: Path | str, error: type[CConvError] = ConfigError) -> Model:
     """An instance of `model` from plain values.
 
     Args:
@@ -132,9 +130,8 @@ def _written_path(values: object, location: Sequence[str | int], is_missing: boo
     """The location without the names of union members, which stand in no file."""
     path = []
     for place, part in enumerate(location, start=1):
-        if isinstance(values, Mapping) and part in values:
-            values = values[part]
-        elif isinstance(values, list | tuple) and isinstance(part, int) and part < len(values):
+        known = range(len(values)) if isinstance(values, list | tuple) else values
+        if isinstance(known, range | Mapping) and part in known:
             values = values[part]
         elif not (is_missing and place == len(location)):
             continue

@@ -59,7 +59,20 @@ numbers = st.sampled_from([0, 1, -1, 2**31, 2**63, 2**64, 10**400, 0.0, -0.5, 1e
     st.floats() | st.integers()
 )
 strings = st.sampled_from(
-    ["", "a", "../../evil", "/tmp/evil", "r[0-9]*", "[/red]", "a\nb", "\x1b[2J", "\x00", "x" * 5000, "random_0", "baseline"]
+    [
+        "",
+        "a",
+        "../../evil",
+        "/tmp/evil",
+        "r[0-9]*",
+        "[/red]",
+        "a\nb",
+        "\x1b[2J",
+        "\x00",
+        "x" * 5000,
+        "random_0",
+        "baseline",
+    ]
 ) | st.text(max_size=8)
 containers = st.sampled_from([[], {}, [[]], nested(40), nested(200), [1000, 1000], [float("nan")], {"a": {"b": 1}}])
 values = numbers | strings | containers
@@ -148,9 +161,12 @@ def check_call(*arguments):
     """Run the command line; its status is 0, or 2 with one line."""
     out, error = io.StringIO(), io.StringIO()
     arguments = ["cconv", *(str(argument) for argument in arguments)]
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error), mock.patch.object(sys, "argv", arguments):
-        with limits(), pytest.raises(SystemExit) as ended:
-            main()
+    with contextlib.ExitStack() as stack:
+        for context in (contextlib.redirect_stdout(out), contextlib.redirect_stderr(error), limits()):
+            stack.enter_context(context)
+        stack.enter_context(mock.patch.object(sys, "argv", arguments))
+        ended = stack.enter_context(pytest.raises(SystemExit))
+        main()
     status = ended.value.code or 0
     assert status in (0, 2)
     if status == 2:

@@ -22,6 +22,10 @@ def _at(where: tuple[str, ...], problem: str, came: object) -> ValidationError:
     return ValidationError.from_exception_data("SearchSpace", [InitErrorDetails(type=kind, loc=where, input=came)])
 
 
+def _is_number(value: object, kind) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 class _Parameter(StrictModel):
     """What all domains share: the reason, and `when`, the values of other parameters that make this one active."""
 
@@ -81,7 +85,7 @@ class IntRange(_Range):
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return type(value) is int and self.range[0] <= value <= self.range[1]
+        return _is_number(value, int) and self.range[0] <= value <= self.range[1]
 
 
 class FloatRange(_Range):
@@ -93,7 +97,7 @@ class FloatRange(_Range):
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return type(value) in (int, float) and self.range[0] <= value <= self.range[1]
+        return _is_number(value, int | float) and self.range[0] <= value <= self.range[1]
 
 
 Parameter = Annotated[Choice | IntRange | FloatRange, Field(discriminator="type")]

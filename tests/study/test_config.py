@@ -117,7 +117,9 @@ def test_a_setting_that_cannot_be_read_is_named(setting, study_file):
         load_study(study_file(MINIMAL), [setting])
 
 
-@pytest.mark.parametrize("name", ["../../evil", "/tmp/evil", "r[0-9]*", "a/b", "", "a\nb", "[/red]", "a..b", "x" * 65, "1"])
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/tmp/evil", "r[0-9]*", "a/b", "", "a\nb", "[/red]", "a..b", "x" * 65, "1"]
+)
 @pytest.mark.parametrize("setting", ["name", "stage", "finalist", "reads", "space"])
 def test_names_follow_one_pattern(name, setting, study_file):
     quoted = json.dumps(name)

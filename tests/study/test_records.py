@@ -5,7 +5,13 @@ import pytest
 from cconv.errors import ConfigError, DataError
 from cconv.study.records import FORMAT, RunFolder, write_json
 
-CONFIG = {"stage": "random", "parameters": {"kernel_size": 4}, "num_parameters": 12, "flops_per_particle": 9.0, "init_seed": 0}
+CONFIG = {
+    "stage": "random",
+    "parameters": {"kernel_size": 4},
+    "num_parameters": 12,
+    "flops_per_particle": 9.0,
+    "init_seed": 0,
+}
 STUDY = {"format": FORMAT, "stages": {"random": {"kind": "random"}}}
 ENTRY = {"updates": 5, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 

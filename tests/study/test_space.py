@@ -197,7 +197,10 @@ def costing(flops):
         (BASIS.replace('= "grid"', '= "radial"') + SKIP, r"the baseline is not possible .*skip 'after_activation'"),
         (FLOAT.replace("1e-2]", "inf]"), r"`parameters\.learning_rate\.range\.1`: input should be a finite number"),
         (FLOAT.replace("1e-4", "1e-300"), r"the value 1e-300 is not possible"),
-        (INT.replace("= 4", "= true"), r"`parameters\.kernel_size\.baseline`: input should be a valid integer, got True"),
+        (
+            INT.replace("= 4", "= true"),
+            r"`parameters\.kernel_size\.baseline`: input should be a valid integer, got True",
+        ),
         (INT.replace("[3, 6]", "[3, 100000000000]"), r"range\.1`: input should be less than or equal to 1000000000"),
         (CHOICE.replace('["none",', "[nan,"), r"`parameters\.window\.values\.0`: must be true, false, a number"),
         (CHOICE.replace('"none"', ", ".join(f'"{n}"' for n in range(200))), "list should have at most 100 items"),
@@ -234,7 +237,8 @@ def test_layers_of_a_huge_space_are_drawn_without_listing_them():
     for name in ("window", "mapping", "interpolation", "message", "normalize"):
         choices[name] = [f"{name}{number}" for number in range(50)]
     parameters = {
-        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "r"} for name, values in choices.items()
+        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "r"}
+        for name, values in choices.items()
     }
     space = SearchSpace.model_validate({"name": "huge", "description": "d", "parameters": parameters})
     network = NetworkConfig(basis="radial")

@@ -120,6 +120,6 @@ def test_a_huge_list_of_contents_is_refused(saved):
 )
 def test_a_damaged_description_is_named(saved, name, text, message):
     (saved[2] / name).write_text(text)
+    read = load_model if name == "config.json" else read_card
     with pytest.raises(ConfigError, match=message):
-        load_model(saved[2])
-        read_card(saved[2])
+        read(saved[2])
