@@ -5,6 +5,7 @@ to a few frames and compared on a few others; some of those that none beats in e
 training split and become finalists.
 """
 
+import math
 import random
 import time
 from bisect import bisect_right
@@ -207,10 +208,14 @@ def _fit_and_record(
     except ConfigError as error:
         folder.finish("failed", str(error))
         return
+    error = normalized_mse(frame_errors(model, valid))
+    if not math.isfinite(error):
+        folder.finish("failed", "its predictions are not finite")
+        return
     entry = {
         "updates": 0,
         "train_loss": None,
-        "valid_normalized_mse": normalized_mse(frame_errors(model, valid)),
+        "valid_normalized_mse": error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
         "diverged": False,
