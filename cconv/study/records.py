@@ -22,6 +22,7 @@ from cconv.validation import Flag, Id, Name, OpenModel, Real, Value, Whole, chec
 FORMAT = 2  # of a run folder; another one is refused
 DIVERGED_ERROR = 1e9  # Optuna needs a finite number where a trial diverged; our records hold none there
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
+KNOWN_BEFORE = ("init_seed", "num_parameters", "flops_per_particle")  # a training begins
 
 _Count = Annotated[Whole, Field(ge=0, lt=2**63)]
 _Error = Annotated[Real, Field(ge=0)]
@@ -59,7 +60,7 @@ class _Config(OpenModel):
 
     stage: Name
     parameters: dict[str, Value]
-    init_seed: Annotated[Whole, Field(ge=0, lt=2**32)]
+    init_seed: Annotated[Whole, Field(ge=0, lt=2**32)] | None = None
     num_parameters: _Count | None = None
     flops_per_particle: _Error | None = None
     closed_form: Flag = False
@@ -289,7 +290,7 @@ class TrialFolder:
         Raises:
             DataError: If a file is damaged.
         """
-        config = {"num_parameters": None, "flops_per_particle": None} | read_record(self.path / "config.json", _Config)
+        config = dict.fromkeys(KNOWN_BEFORE) | read_record(self.path / "config.json", _Config)
         end = {"outcome": "interrupted", "reason": ""}
         if self.ended:
             end = read_record(self.path / "outcome.json", _Outcome)
@@ -397,7 +398,7 @@ class RunFolder:
         path = self.trial(record.id).path / "config.json"
         if record.stage != stage:
             raise DataError(f"{path}: `stage` must be {stage!r}, got {shown(record.stage)}; restore the file.")
-        for name in ("num_parameters", "flops_per_particle"):  # None where it failed before it began
+        for name in KNOWN_BEFORE:  # None where it failed before it began
             if record.log and record.config[name] is None:
                 raise DataError(f"{path}: `{name}` is missing, though the trial was evaluated; restore the file.")
 
@@ -419,6 +420,9 @@ class RunFolder:
         for finalist in _folders(self.path / "finalists"):
             seeds = [TrialFolder(folder) for folder in _folders(finalist) if re.fullmatch(r"seed_\d+", folder.name)]
             read = [folder.read() for folder in seeds if folder.started]
+            for record in read:
+                if record.config["init_seed"] not in (None, int(record.id.removeprefix("seed_"))):
+                    raise DataError(f"{finalist / record.id}/config.json: `init_seed` is not that of the folder.")
             if read:
                 records[checked_id(finalist.name)] = read
         return records

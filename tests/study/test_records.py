@@ -224,3 +224,12 @@ def test_a_record_that_is_no_text_or_no_file_is_named(tmp_path):
     (tmp_path / "rungs.json").mkdir()
     with pytest.raises(DataError, match=r"rungs\.json: no regular file"):
         RunFolder(tmp_path).read("rungs.json")
+
+
+def test_a_retraining_has_the_seed_of_its_folder(tmp_path):
+    run = RunFolder(tmp_path)
+    run.finalist("baseline", 1).start(CONFIG | {"init_seed": 1})
+    assert [record.id for record in run.retrainings()["baseline"]] == ["seed_1"]
+    run.finalist("baseline", 2).start(CONFIG | {"init_seed": 1})
+    with pytest.raises(DataError, match="seed_2/config.json: `init_seed` is not that of the folder"):
+        run.retrainings()
