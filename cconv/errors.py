@@ -5,6 +5,8 @@ import os
 from collections.abc import Iterable
 from errno import EDQUOT, ENOSPC
 
+LONGEST_SHOWN = 100  # characters of a value in a message
+
 
 class CConvError(ValueError):
     """Base of every error that `cconv` raises on purpose."""
@@ -51,13 +53,30 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise `ConfigError` unless `value` is one of `choices`; the message names the nearest."""
     choices = list(choices)
     if value not in choices:
-        raise ConfigError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.{did_you_mean(value, choices)}")
+        raise ConfigError(
+            f"`{name}` must be one of {', '.join(choices)}, got {shown(value)}.{did_you_mean(value, choices)}"
+        )
 
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:
     """A hint ``' Did you mean ...?'`` with the nearest known name, or an empty string."""
-    nearest = difflib.get_close_matches(str(value), list(known), n=1, cutoff=0.5)
+    word = value if isinstance(value, str) else shown(value)
+    nearest = difflib.get_close_matches(word[:LONGEST_SHOWN], list(known), n=1, cutoff=0.5)
     return f" Did you mean {nearest[0]!r}?" if nearest else ""
+
+
+def shown(value: object) -> str:
+    """A value as Python writes it, cut where it is long, for a message."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, a list of lists of lists ...
+        return f"a {type(value).__name__} that is too long to show"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
+def visible(text: str) -> str:
+    """The text with control characters written as escapes, so that it cannot steer a terminal; newlines too."""
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
 
 
 def is_disk_full(error: Exception) -> bool:

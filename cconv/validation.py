@@ -1,13 +1,25 @@
-"""One clear line for a file that does not fit its pydantic model: file, key, what is wrong, nearest name."""
+"""Types of settings, each with a finite range, and one clear line for what does not fit: file, key, nearest name."""
 
+import re
 import typing
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 
-from cconv.errors import ConfigError, did_you_mean
+from cconv.errors import CConvError, ConfigError, did_you_mean, shown, visible
 
 
 class StrictModel(BaseModel):
@@ -16,53 +28,114 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-Value = bool | int | float | str  # of a hyperparameter
+class OpenModel(BaseModel):
+    """What must stand in a record, beside anything else."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+Flag = Annotated[bool, Strict()]
+Whole = Annotated[int, Strict()]  # true is no 1
+Real = Annotated[float, Strict(), AllowInfNan(False)]
+Length = Annotated[Real, Field(ge=1e-12, le=1e12)]  # or another positive quantity in the units of the data
+Seed = Annotated[Whole, Field(ge=0, lt=2**31)]  # stages count on from it, and some libraries take 32 bits
+
+LARGEST_VALUE, LONGEST_TEXT = 1e12, 4096
+NAME_PATTERN = r"[A-Za-z][A-Za-z0-9_.-]*"
+
+
+def _check_name(name: str, longest: int = 64) -> str:
+    if not re.fullmatch(NAME_PATTERN, name) or len(name) > longest or ".." in name:
+        raise ValueError(f"a name must match ^{NAME_PATTERN}$, have at most {longest} letters and hold no `..`")
+    return name
+
+
+def _check_text(text: str) -> str:
+    if not all(char.isprintable() or char in "\n\t" for char in text):
+        raise ValueError("a text must hold no control characters")
+    return text
+
+
+def _check_path(path: str) -> str:
+    if not path or not path.isprintable():
+        raise ValueError("a path must hold at least one character and no control characters")
+    return path
+
+
+def _check_value(value: object) -> object:
+    number = isinstance(value, int | float) and abs(value) <= LARGEST_VALUE  # no nan either
+    text = isinstance(value, str) and len(value) <= 200 and value.isprintable()
+    if not (number or text):
+        raise ValueError(f"must be true, false, a number of at most {LARGEST_VALUE:g} or a text of up to 200 letters")
+    return value
+
+
+Name = Annotated[str, AfterValidator(_check_name)]  # of a study, stage or finalist: they become folders
+Id = Annotated[str, AfterValidator(partial(_check_name, longest=160))]  # made of a name and what follows from it
+Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_check_text)]
+PathText = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_check_path)]
+Value = Annotated[bool | int | float | str, PlainValidator(_check_value)]  # of a hyperparameter
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validated(model: type[Model], values: Mapping, source: Path | str) -> Model:
+def validated(model: type[Model], values: object, source: Path | str, error: type[CConvError] = ConfigError) -> Model:
     """An instance of `model` from plain values.
 
     Args:
         model: The pydantic model that the values must fit.
         values: What came, e.g. a parsed TOML file.
         source: File that the values came from, for the message.
+        error: Kind of error to raise.
 
     Raises:
-        ConfigError: With source, key and the first thing that is wrong.
+        CConvError: Of the kind `error`, with source, key and the first thing that is wrong.
     """
     try:
         return model.model_validate(values)
-    except ValidationError as error:
+    except ValidationError as problems:
         # A misspelt key is unknown, and missing under its right name; the first says more.
-        problem = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
-        raise ConfigError(f"{source}: {_describe(model, values, problem)}") from error
+        problem = min(problems.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+        raise error(f"{source}: {_describe(model, values, problem)}") from problems
 
 
-def _describe(model: type[BaseModel], values: Mapping, problem: Mapping) -> str:
-    location = [str(part) for part in problem["loc"]]
-    key = ".".join(_written_path(values, location)) or "the file"
+def check_setting(annotation: object, value: object, name: str) -> None:
+    """Raise `ConfigError` unless a value, e.g. an option of the command line, fits one of the types above."""
+    try:
+        TypeAdapter(annotation).validate_python(value)
+    except ValidationError as problems:
+        raise ConfigError(f"`{name}`: {_sentence(problems.errors()[0])}") from problems
+
+
+def _describe(model: type[BaseModel], values: object, problem: Mapping) -> str:
+    location = [part for part in problem["loc"] if part != "[key]"]
+    written = _written_path(values, location, problem["type"] == "missing")
+    key = ".".join(visible(str(part)[:80]) for part in written)
     if problem["type"] == "extra_forbidden":
         known = _known_keys(model, location[:-1])
         listed = f" Known: {', '.join(known)}." if known else ""
         return f"unknown key `{key}`.{did_you_mean(location[-1], known)}{listed}"
     if problem["type"] == "missing":
         return f"`{key}` is missing; add it."
+    return f"`{key}`: {_sentence(problem)}" if key else _sentence(problem)
+
+
+def _sentence(problem: Mapping) -> str:
     message = problem["msg"].removeprefix("Value error, ")
-    came = "" if isinstance(problem["input"], Mapping) else f", got {problem['input']!r}"
-    return f"`{key}`: {message[0].lower()}{message[1:]}{came}."
+    came = "" if isinstance(problem["input"], Mapping) else f", got {shown(problem['input'])}"
+    return f"{message[0].lower()}{message[1:]}{came}."
 
 
-def _written_path(values: object, location: Sequence[str]) -> list[str]:
+def _written_path(values: object, location: Sequence[str | int], is_missing: bool) -> list[str | int]:
     """The location without the names of union members, which stand in no file."""
     path = []
-    for part in location:
-        inner = values.get(part) if isinstance(values, Mapping) else None
-        if inner is None and part != location[-1]:
+    for place, part in enumerate(location, start=1):
+        known = range(len(values)) if isinstance(values, list | tuple) else values
+        if isinstance(known, range | Mapping) and part in known:
+            values = values[part]
+        elif not (is_missing and place == len(location)):
             continue
         path.append(part)
-        values = inner
     return path
 
 

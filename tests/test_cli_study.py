@@ -68,7 +68,8 @@ def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
 
 
 def test_a_training_that_diverges_says_so(cconv, flow_folder, tmp_path):
-    settings = ["--set", "training.learning_rate=1e30"]
+    large = ("training.learning_rate=1e3", "network.layers=12", "network.activation=leaky_relu")
+    settings = [part for setting in large for part in ("--set", setting)]
     status, _, error = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *settings)
     assert status == 1
     assert "Diverged" in error

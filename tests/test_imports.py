@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "cconv"
 # A module may import from its own tier and from those before it.
 TIERS = [
     {"compiled", "errors"},
+    {"files"},
     {"cell_list", "domain", "neighbors", "validation"},
     {"ops", "sph"},
     {"nn"},
@@ -18,6 +19,7 @@ TIERS = [
     {"study"},
     {"report"},
     {"cli"},
+    {"__main__"},
 ]
 LEVEL = {room: level for level, tier in enumerate(TIERS) for room in tier}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")

@@ -1,20 +1,21 @@
 """The command line: the only place that parses arguments and prints."""
 
 import sys
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
-from cconv.cli.console import errors
+from cconv.cli.console import errors, results
 from cconv.cli.data import app as data_app
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.study import app as study_app
-from cconv.errors import CConvError, StudyError, is_disk_full
+from cconv.errors import CConvError, StudyError, is_disk_full, visible
 
 INTERRUPTED = 130
 
 app = typer.Typer(
     name="cconv",
-    help="Find the smallest, fastest continuous-convolution network that is accurate and stable enough for your fluid.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -25,18 +26,33 @@ for command in (train, fit, evaluate, report):
     app.command()(command)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        results.print(f"cconv {version('cconv')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Find the smallest, fastest continuous-convolution network that is accurate and stable enough for your fluid."""
+
+
 def main() -> None:
     """Run the command line; bad input ends in one line on stderr and exit status 2, a study without a result in 1."""
     try:
         app()
     except CConvError as error:
-        errors.print(f"cconv: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        errors.print(visible(f"cconv: {error}"), style="bold red", soft_wrap=True)
         sys.exit(1 if isinstance(error, StudyError) else 2)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         remedy = "; make room, then `cconv study resume` goes on" if is_disk_full(error) else ""
         line = f"cconv: {place}{error.strerror or str(error) or type(error).__name__}{remedy}"
-        errors.print(line, style="bold red", markup=False, highlight=False, soft_wrap=True)
+        errors.print(visible(line), style="bold red", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

@@ -4,15 +4,42 @@ import json
 from collections.abc import Iterable, Iterator
 
 from rich.console import Console
-from rich.progress import track
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
-results = Console()
-errors = Console(stderr=True)
+from cconv.errors import visible
+
+
+class PlainConsole(Console):
+    """A console that shows strings as they are, in tables and live displays too.
+
+    Names and reasons come from files of others. So no string is read as markup or an emoji's name, and control
+    characters are written as escapes; whoever wants a style gives a `Text`.
+    """
+
+    def __init__(self, **options):
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def render_str(self, text: str, **options) -> Text:
+        """The string as a `Text`, its lines kept."""
+        plain = "\n".join(visible(line) for line in text.split("\n"))
+        return super().render_str(plain, **options | {"markup": False, "emoji": False})
+
+
+results = PlainConsole()
+errors = PlainConsole(stderr=True)
+
+
+def plain_column(text: str) -> TextColumn:
+    """A column of a progress display whose fields are shown as they are."""
+    return TextColumn(text, markup=False)
 
 
 def show_progress(items: Iterable, label: str) -> Iterator:
     """The items, with a progress bar on stderr while that is a terminal."""
-    return iter(track(items, description=label, console=errors, transient=True, disable=not errors.is_terminal))
+    columns = (plain_column("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+        yield from progress.track(items, description=visible(label))
 
 
 def print_json(value: object) -> None:

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress
 from rich.table import Table
+
+from cconv.cli.console import plain_column
 
 ROWS = 12
 
@@ -52,7 +54,7 @@ class StudyDisplay:
         """Begin a stage with an empty table."""
         self._stage, self._num_trials, self._max_updates = stage, num_trials, max_updates
         self._rows, self._began = {}, time.monotonic()
-        self.console.print(f"[bold]{stage}[/bold]: {num_trials} trainings of up to {max_updates} updates")
+        self.console.print(f"{stage}: {num_trials} trainings of up to {max_updates} updates", style="bold")
 
     def on_trial_start(self, trial: str, parameters: Mapping) -> None:
         """Add a row."""
@@ -73,7 +75,6 @@ class StudyDisplay:
             self.console.print(
                 f"{self._stage} {ended}/{self._num_trials}  {trial}  {outcome} at {row.updates} updates, "
                 f"error {_number(row.error)}, best {_number(self._best())}{self._time_left()}  {reason}".rstrip(),
-                highlight=False,
                 soft_wrap=True,
             )
 
@@ -120,9 +121,9 @@ class TrainingBar:
     def __init__(self, console: Console, name: str, updates: int):
         self._console, self._updates, self._best = console, updates, None
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            plain_column("{task.description}"),
             BarColumn(),
-            TextColumn("{task.completed}/{task.total} updates  {task.fields[figures]}"),
+            plain_column("{task.completed}/{task.total} updates  {task.fields[figures]}"),
             console=console,
             disable=not console.is_terminal,
         )
@@ -146,7 +147,7 @@ class TrainingBar:
         self._progress.update(self._task, completed=state.updates, figures=figures)
         if valid is not None and not self._console.is_terminal:
             line = f"{state.updates}/{self._updates} updates, validation error {valid:.4g}, {figures}"
-            self._console.print(line, highlight=False, soft_wrap=True)
+            self._console.print(line, soft_wrap=True)
 
 
 def _number(value: float | None) -> str:

@@ -1,5 +1,6 @@
 """`cconv train`, `cconv fit`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
 
+import math
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +10,8 @@ import typer
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
-from cconv.errors import CConvError, ConfigError
+from cconv.errors import CConvError, ConfigError, DataError
+from cconv.validation import check_setting
 
 
 def train(
@@ -68,9 +70,11 @@ def fit(
     """
     from cconv.evaluation.metrics import frame_errors, normalized_mse
     from cconv.study.problem import provenance
+    from cconv.study.stages import Ridge
     from cconv.training.checkpoint import save_model
     from cconv.training.closed_form import solve_closed_form
 
+    check_setting(Ridge, ridge, "--ridge")
     config, problem = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.network, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
@@ -87,7 +91,6 @@ def fit(
     results.print(
         f"Validation error {error:.4g} (normalized MSE), {model.num_parameters:,} parameters. Checkpoint: {out}",
         soft_wrap=True,
-        highlight=False,
     )
 
 
@@ -116,6 +119,8 @@ def evaluate(
     samples = iterate_samples(dataset, split, model.config.task, model.kernel)
     frames = frame_errors(model, show_progress(samples, f"evaluate {split}"))
     mse = normalized_mse(frames)
+    if not math.isfinite(mse):
+        raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
     facts = {
         "checkpoint": str(checkpoint),
         "data": str(dataset.path),
@@ -132,17 +137,32 @@ def evaluate(
         return
     results.print(
         f"{split}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {len(frames)} frames "
-        f"({model.config.task}, {model.num_parameters:,} parameters)",
-        highlight=False,
+        f"({model.config.task}, {model.num_parameters:,} parameters)"
     )
 
 
 def report(path: RunPath) -> None:
     """Write report.html of a run again, also of one that was interrupted."""
-    from cconv.report.page import write_report
-    from cconv.study.records import RunFolder
+    from jinja2 import TemplateError
 
-    results.print(f"Report: {write_report(RunFolder.open(path))}", soft_wrap=True)
+    from cconv.report.page import write_report
+    from cconv.study.config import recorded_study
+    from cconv.study.records import RunFolder
+    from cconv.study.space import recorded_space
+
+    run = RunFolder.open(path)
+    recorded_study(run), recorded_space(run)  # whose every key the page may show
+    try:
+        written = write_report(run)
+    except CConvError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, TemplateError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise DataError(
+            f"{path}: summary.json or another record lacks what the report shows, or holds something else there "
+            f"({reason}); restore it, or run the study again."
+        ) from error
+    results.print(f"Report: {written}", soft_wrap=True)
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:

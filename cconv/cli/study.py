@@ -82,7 +82,7 @@ def run(
     config = load_study(study, settings or [])
     if data is not None:
         config = with_data_path(config, data)
-    space = load_space(config.search.space)
+    space = load_space(config.search.space, config)
     open_study_data(config.data, config.seeds.data)
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
     begin_study(config, space, folder)
@@ -114,7 +114,7 @@ def resume(path: RunPath, data: DataPath = None, address: Address = None, storag
 def extend(
     path: RunPath,
     stage: Annotated[str, typer.Option("--stage", help="Search to extend, by its name in the study file.")],
-    trials: Annotated[int, typer.Option("--trials", min=1, help="How many trials to add.")],
+    trials: Annotated[int, typer.Option("--trials", min=1, max=100_000, help="How many trials to add.")],
     address: Address = None,
     storage: Storage = None,
 ) -> None:
@@ -145,10 +145,10 @@ def _run_stages(folder: "RunFolder", address: str | None, storage: str | None) -
     report = write_report(folder)
     if summary is not None:
         results.print(_finalists_table(summary))
-        results.print(summary["recommended"]["reason"], highlight=False)
+        results.print(summary["recommended"]["reason"])
         if summary["budget"]:
-            results.print(summary["budget"], highlight=False)
-        results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes.", highlight=False)
+            results.print(summary["budget"])
+        results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes.")
     results.print(f"Report: {report}", soft_wrap=True)
 
 
@@ -177,7 +177,7 @@ def status(
     if as_json:
         print_json(facts)
         return
-    results.print(f"{path}: {facts['state']}, stage {facts['stage']}", highlight=False)
+    results.print(f"{path}: {facts['state']}, stage {facts['stage']}")
     for stage, counts in facts["trials"].items():
         results.print(f"{stage}: " + ", ".join(f"{number} {name}" for name, number in counts.items() if number))
     if best is not None:

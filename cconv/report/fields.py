@@ -3,13 +3,16 @@
 Neither Ray nor torch is imported.
 """
 
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cconv.errors import DataError
 from cconv.report.colors import MARKED
 from cconv.report.plots import new_figure
 from cconv.study.records import RunFolder
@@ -89,8 +92,11 @@ def error_distribution_chart(explanations: Mapping[str, Explanation], baseline: 
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as arrays:
-        return dict(arrays)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except (OSError, EOFError, ValueError, BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: no arrays of a model's explanation ({error}); delete or restore it.") from error
 
 
 def _draw_axis(axes: Axes, explanation: Explanation, axis: int, spacing: float) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cconv.study.records import read_json, write_json
+from cconv.study.records import read_rungs, write_json
 
 
 def rungs_up_to(full_updates: int, grace_updates: int, reduction_factor: int) -> list[int]:
@@ -66,7 +66,7 @@ class RungFile:
 
     def read(self) -> dict[str, list[dict]]:
         """Rungs of every stage that has any."""
-        return read_json(self._path) if self._path.is_file() else {}
+        return read_rungs(self._path)
 
     def table(self, stage: str, rungs: Sequence[int], reduction_factor: int) -> RungTable:
         """The table of a stage as it was left, or an empty one."""

@@ -5,9 +5,13 @@ to a few frames and compared on a few others; some of those that none beats in e
 training split and become finalists.
 """
 
+import math
+import random
 import time
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate
 
 import numpy as np
 
@@ -28,6 +32,7 @@ from cconv.training.closed_form import solve_closed_form
 from cconv.training.field_model import NetworkConfig
 
 STAGE = "closed_form"
+MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
 BRANCHES = ("boundary", "density")  # what a model may do without
 _OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message", "boundary", "density")
 _OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"), "radial": ("radial_terms",)}
@@ -37,6 +42,7 @@ def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: 
     """Distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
 
     Conditions hold as in the search. A space of deeper networks only has single layers too, as a floor to compare with.
+    Of a space that holds more than `MOST_LAYERS` of them, so many are drawn at random.
 
     Args:
         space: The search space.
@@ -47,11 +53,8 @@ def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: 
     for name in space.parents_first:
         values = [1] if name == "layers" else _values(space.parameters[name], values_per_range)
         if name in ("layers", *_OF_ANY, *_OF_BASIS["grid"], *_OF_BASIS["radial"]):
-            drawn = [
-                layer | choice
-                for layer in drawn
-                for choice in ([{name: value} for value in values] if space.is_active(name, layer) else [{}])
-            ]
+            choices = [{name: value} for value in values]
+            drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
     layers: dict[str, dict] = {}
     for values in drawn:
         basis = values.get("basis", network.basis)
@@ -59,6 +62,16 @@ def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: 
         layer = {"layers": 1, "basis": basis, **{name: value for name, value in values.items() if name in applies}}
         layers.setdefault(layer_id(layer), layer)
     return list(layers.values())
+
+
+def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
+    """Each layer with each of its choices, in order; `MOST_LAYERS` of them, drawn at random, where there are more."""
+    ends = list(accumulate(map(len, choices)))
+    places = range(ends[-1])
+    if len(places) > MOST_LAYERS:
+        places = sorted(random.Random(0).sample(places, MOST_LAYERS))
+    owners = ((place, bisect_right(ends, place)) for place in places)
+    return [layers[owner] | choices[owner][place - ends[owner]] for place, owner in owners]
 
 
 def screen_closed_forms(session: Session, stage: str) -> dict:
@@ -195,10 +208,14 @@ def _fit_and_record(
     except ConfigError as error:
         folder.finish("failed", str(error))
         return
+    error = normalized_mse(frame_errors(model, valid))
+    if not math.isfinite(error):
+        folder.finish("failed", "its predictions are not finite")
+        return
     entry = {
         "updates": 0,
         "train_loss": None,
-        "valid_normalized_mse": normalized_mse(frame_errors(model, valid)),
+        "valid_normalized_mse": error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
         "diverged": False,

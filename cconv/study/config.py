@@ -3,31 +3,40 @@
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from cconv.errors import ConfigError
+from cconv.errors import LONGEST_SHOWN, ConfigError, DataError, did_you_mean, shown, visible
+from cconv.files import DEEPEST, parse_toml, read_toml
 from cconv.sph.kernels import KERNELS
 from cconv.study.asha import rungs_up_to
-from cconv.study.stages import Stage, check_order, default_stages
+from cconv.study.records import RunFolder
+from cconv.study.stages import Stage, check_names, check_order, default_stages, included
 from cconv.training.field_model import NetworkConfig
-from cconv.validation import StrictModel, validated
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole, validated
+
+MOST_UPDATES = 10**9
+Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
+_Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
+_Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
+_Share = Annotated[Real, Field(ge=1e-6, le=1e6)]
 
 
 class DataConfig(StrictModel):
     """Particle data and targets. Lengths and times in the units of the data; None takes what the data say."""
 
-    path: str | None = None
-    particle_spacing: float | None = Field(None, gt=0)
-    mass: float | None = Field(None, gt=0)
-    frame_dt: float | None = Field(None, gt=0)
-    force: tuple[float, ...] | None = None
+    path: PathText | None = None
+    particle_spacing: Length | None = None
+    mass: Length | None = None
+    frame_dt: Length | None = None
+    force: tuple[_Component, ...] | None = Field(None, min_length=1, max_length=3)
     kernel: str = "cubic_spline"
-    smoothing_length: float | None = Field(None, gt=0)
-    split_fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
-    gap: int = Field(2, ge=0)
+    smoothing_length: Length | None = None
+    split_fractions: tuple[_Share, _Share, _Share] = (0.7, 0.15, 0.15)
+    gap: Whole = Field(2, ge=0, le=10**6)
 
     @field_validator("kernel")
     @classmethod
@@ -40,12 +49,12 @@ class DataConfig(StrictModel):
 class TrainingConfig(StrictModel):
     """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache."""
 
-    updates: int = Field(600, ge=1)
-    evaluate_every: int = Field(50, ge=1)
-    batch_size: int = Field(1, ge=1)
-    learning_rate: float = Field(1e-3, gt=0)
+    updates: Updates = 600
+    evaluate_every: Updates = 50
+    batch_size: Whole = Field(1, ge=1, le=10**6)
+    learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
     schedule: Literal["constant", "cosine", "exponential"] = "cosine"
-    cache_megabytes: int = Field(2048, ge=0)
+    cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
 
 
 class SearchConfig(StrictModel):
@@ -56,20 +65,20 @@ class SearchConfig(StrictModel):
     None means as many trials at once as cores.
     """
 
-    space: str
-    grace_updates: int = Field(50, ge=1)
-    reduction_factor: int = Field(3, ge=2)
-    give_up_above: float = Field(10.0, gt=0)
-    trial_seconds: float = Field(3600.0, gt=0)
-    concurrency: int | None = Field(None, ge=1)
+    space: PathText
+    grace_updates: Updates = 50
+    reduction_factor: Whole = Field(3, ge=2, le=1000)
+    give_up_above: Real = Field(10.0, ge=1e-12, le=1e9)
+    trial_seconds: Real = Field(3600.0, ge=1e-3, le=1e7)
+    concurrency: Whole | None = Field(None, ge=1, le=4096)
 
 
 class FinalistsConfig(StrictModel):
     """Protocol of every retraining and test. `updates` None means the search's budget."""
 
-    seeds: int = Field(5, ge=2)
-    updates: int | None = Field(None, ge=1)
-    frames_per_block: int = Field(3, ge=1)
+    seeds: Whole = Field(5, ge=2, le=1000)
+    updates: Updates | None = None
+    frames_per_block: Whole = Field(3, ge=1, le=10**6)
 
 
 class SelectionConfig(StrictModel):
@@ -79,31 +88,38 @@ class SelectionConfig(StrictModel):
     model may be, as a share of the best error, to count as not inferior.
     """
 
-    accurate_enough: float | None = Field(None, gt=0)
-    margin: float = Field(0.05, gt=0)
+    accurate_enough: Real | None = Field(None, ge=1e-15, le=1e6)
+    margin: Real = Field(0.05, ge=1e-9, le=100)
 
 
 class CostConfig(StrictModel):
     """Isolated timing of the finalists; of `trials` further models for the check of the cost model; growth with N."""
 
-    threads: int = Field(1, ge=1)
-    repeats: int = Field(20, ge=3)
-    trials: int = Field(6, ge=0)
-    sizes: tuple[int, ...] = (1000, 3000, 10_000, 30_000, 100_000)
+    threads: Whole = Field(1, ge=1, le=1024)
+    repeats: Whole = Field(20, ge=3, le=10_000)
+    trials: Whole = Field(6, ge=0, le=10_000)
+    sizes: tuple[_Size, ...] = Field((1000, 3000, 10_000, 30_000, 100_000), min_length=1, max_length=20)
+
+    @field_validator("sizes")
+    @classmethod
+    def _ascending(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
+        if not all(low < high for low, high in pairwise(sizes)):
+            raise ValueError("sizes must ascend, each one once")
+        return sizes
 
 
 class SeedsConfig(StrictModel):
     """Three seeds, never one: split and batch order, initial weights, sampling of configurations."""
 
-    data: int = Field(0, ge=0)
-    init: int = Field(0, ge=0)
-    search: int = Field(0, ge=0)
+    data: Seed = 0
+    init: Seed = 0
+    search: Seed = 0
 
 
 class StudyConfig(StrictModel):
     """A whole study."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    name: Name
     task: Literal["density_rate", "density_gradient"]
     data: DataConfig = DataConfig()
     network: NetworkConfig = NetworkConfig()
@@ -113,7 +129,7 @@ class StudyConfig(StrictModel):
     cost: CostConfig = CostConfig()
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
-    stages: dict[str, Stage] = Field(default_factory=default_stages, min_length=1)
+    stages: dict[Name, Stage] = Field(default_factory=default_stages, min_length=1, max_length=100)
 
     @field_validator("stages", mode="before")
     @classmethod
@@ -125,6 +141,7 @@ class StudyConfig(StrictModel):
     @field_validator("stages")
     @classmethod
     def _stages_read_earlier_ones(cls, stages: dict[str, Stage]) -> dict[str, Stage]:
+        check_names(stages)
         check_order(stages)
         return stages
 
@@ -143,6 +160,16 @@ class StudyConfig(StrictModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _included_are_possible(self) -> "StudyConfig":
+        for finalist, parameters in included(self.stages):
+            try:
+                check_known(parameters)
+                configure(parameters, self.network, self.training)
+            except ConfigError as error:
+                raise ValueError(f"finalist `{finalist}`: {error}") from error
+        return self
+
     @property
     def rungs(self) -> list[int]:
         """Updates of ASHA's rungs, the full budget last."""
@@ -154,18 +181,39 @@ class StudyConfig(StrictModel):
         return self.search.concurrency or os.cpu_count() or 1
 
 
-def read_toml(path: Path | str) -> dict:
-    """Content of a TOML file.
+TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
+HYPERPARAMETERS = (*NetworkConfig.model_fields, *TRAINING_HYPERPARAMETERS)
+
+
+def check_known(parameters: Mapping[str, Value]) -> None:
+    """Raise `ConfigError` unless all names are those of hyperparameters."""
+    for name in parameters:
+        if name not in HYPERPARAMETERS:
+            raise ConfigError(
+                f"unknown hyperparameter {shown(name)}.{did_you_mean(name, HYPERPARAMETERS)} "
+                f"Known: {', '.join(HYPERPARAMETERS)}."
+            )
+
+
+def configure(
+    parameters: Mapping[str, Value], network: NetworkConfig, training: TrainingConfig
+) -> tuple[NetworkConfig, TrainingConfig]:
+    """Network and training settings with the drawn hyperparameters in place of the study's own.
 
     Raises:
-        ConfigError: If the file is missing or is not TOML.
+        ConfigError: If they are not possible together.
     """
+    drawn = {name: value for name, value in parameters.items() if name in TRAINING_HYPERPARAMETERS}
+    shape = {name: value for name, value in parameters.items() if name not in TRAINING_HYPERPARAMETERS}
     try:
-        return tomllib.loads(Path(path).read_text())
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; give the path of a TOML file.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise ConfigError(f"{path}: not a TOML file ({error}); mend that line.") from error
+        return (
+            NetworkConfig.model_validate(network.model_dump() | shape),
+            TrainingConfig.model_validate(training.model_dump() | drawn),
+        )
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"])) or "together"
+        raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
@@ -189,17 +237,38 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     return study
 
 
+def recorded_study(run: RunFolder) -> StudyConfig:
+    """The study of a run folder.
+
+    Raises:
+        DataError: If its study.json is damaged.
+    """
+    values = {key: value for key, value in run.read("study.json").items() if key not in ("format", "id")}
+    return validated(StudyConfig, values, run.path / "study.json", DataError)
+
+
 def _apply(values: dict, override: str) -> None:
     name, equals, text = override.partition("=")
+    setting = f"--set {visible(override)[:LONGEST_SHOWN]}"
     if not equals:
-        raise ConfigError(f"--set {override}: must read key=value, e.g. training.updates=100.")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text
+        raise ConfigError(f"{setting}: must read key=value, e.g. training.updates=100.")
+    if name.count(".") >= DEEPEST:
+        raise ConfigError(f"{setting}: a key of more than {DEEPEST} parts; see the study file for its keys.")
     *tables, key = name.strip().split(".")
     for table in tables:
         values = values.setdefault(table, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"--set {override}: `{table}` is not a table; see the study file for its keys.")
-    values[key] = value
+            raise ConfigError(f"{setting}: `{table}` is not a table; see the study file for its keys.")
+    values[key] = _value(text, setting)
+
+
+def _value(text: str, setting: str) -> object:
+    """A value in TOML, or else the text itself."""
+    if "\n" in text:
+        raise ConfigError(f"{setting}: must be one line.")
+    try:
+        return parse_toml(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    except ValueError as error:
+        raise ConfigError(f"{setting}: no value for a setting ({error}).") from error

@@ -31,10 +31,10 @@ def train_longer(session: Session, stage: str) -> dict:
     going = list(points)
     for updates in settings.budgets:
         training = own.model_copy(update={"updates": updates})
-        longer = [Finalist(id=f"{name}_{updates}", parameters=models[name]) for name in going]
+        longer = [Finalist(id=f"{name}_after_{updates}", parameters=models[name]) for name in going]
         jobs = finalist_jobs(longer, study.finalists.seeds, study.seeds.init + 1, session.run)
         train_all(session, stage, jobs, training)
-        ends = {name: _point(session, f"{name}_{updates}", updates) for name in going}
+        ends = {name: _point(session, f"{name}_after_{updates}", updates) for name in going}
         for name in going:
             points[name] += [ends[name]] if ends[name] else []
         going = [name for name in going if ends[name] and still_falling(points[name], study.selection.margin)]

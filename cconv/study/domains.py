@@ -7,10 +7,13 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from cconv.errors import did_you_mean
-from cconv.validation import StrictModel
+from cconv.errors import did_you_mean, shown
+from cconv.validation import LARGEST_VALUE, Real, StrictModel, Text, Value, Whole
 
-Value = bool | int | float | str
+MOST_VALUES = 100  # of a choice, or of a condition
+_Whole = Annotated[Whole, Field(ge=-(10**9), le=10**9)]
+_Real = Annotated[Real, Field(ge=-LARGEST_VALUE, le=LARGEST_VALUE)]
+_Values = Annotated[list[Value], Field(min_length=1, max_length=MOST_VALUES)]
 
 
 def _at(where: tuple[str, ...], problem: str, came: object) -> ValidationError:
@@ -19,24 +22,28 @@ def _at(where: tuple[str, ...], problem: str, came: object) -> ValidationError:
     return ValidationError.from_exception_data("SearchSpace", [InitErrorDetails(type=kind, loc=where, input=came)])
 
 
+def _is_number(value: object, kind) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 class _Parameter(StrictModel):
     """What all domains share: the reason, and `when`, the values of other parameters that make this one active."""
 
-    reason: str
-    when: dict[str, Annotated[list[Value], Field(min_length=1)]] = {}
+    reason: Text
+    when: dict[str, _Values] = Field({}, max_length=MOST_VALUES)
 
 
 class Choice(_Parameter):
     """One of a few values, without order."""
 
     type: Literal["choice"]
-    values: list[Value] = Field(min_length=1)
+    values: _Values
     baseline: Value
 
     @model_validator(mode="after")
     def _baseline_is_listed(self) -> "Choice":
-        if self.baseline not in self.values:
-            raise ValueError(f"the baseline {self.baseline!r} must be one of the values {self.values}")
+        if not self.holds(self.baseline):
+            raise ValueError(f"the baseline {self.baseline!r} must be one of the values {shown(self.values)}")
         return self
 
     @property
@@ -45,8 +52,8 @@ class Choice(_Parameter):
         return self.values
 
     def holds(self, value: Value) -> bool:
-        """Whether a value is in the domain."""
-        return value in self.values
+        """Whether a value is in the domain; true is no 1."""
+        return any(value == listed and isinstance(value, bool) == isinstance(listed, bool) for listed in self.values)
 
 
 class _Range(_Parameter):
@@ -73,24 +80,24 @@ class IntRange(_Range):
     """A whole number, both ends included."""
 
     type: Literal["int"]
-    range: tuple[int, int]
-    baseline: int
+    range: tuple[_Whole, _Whole]
+    baseline: _Whole
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return isinstance(value, int) and self.range[0] <= value <= self.range[1]
+        return _is_number(value, int) and self.range[0] <= value <= self.range[1]
 
 
 class FloatRange(_Range):
     """A real number."""
 
     type: Literal["float"]
-    range: tuple[float, float]
-    baseline: float
+    range: tuple[_Real, _Real]
+    baseline: _Real
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return isinstance(value, int | float) and self.range[0] <= value <= self.range[1]
+        return _is_number(value, int | float) and self.range[0] <= value <= self.range[1]
 
 
 Parameter = Annotated[Choice | IntRange | FloatRange, Field(discriminator="type")]
@@ -104,11 +111,11 @@ class SearchSpace(StrictModel):
     than `max_flops_per_particle` multiplications and additions a particle, or move more than `max_bytes_per_particle`.
     """
 
-    name: str
-    description: str
-    max_flops_per_particle: float | None = Field(None, gt=0)
-    max_bytes_per_particle: float | None = Field(None, gt=0)
-    parameters: dict[str, Parameter] = Field(min_length=1)
+    name: Annotated[Text, Field(min_length=1, max_length=200)]
+    description: Text
+    max_flops_per_particle: Real | None = Field(None, gt=0, le=1e18)
+    max_bytes_per_particle: Real | None = Field(None, gt=0, le=1e18)
+    parameters: dict[str, Parameter] = Field(min_length=1, max_length=MOST_VALUES)
 
     @model_validator(mode="after")
     def _conditions_can_hold(self) -> "SearchSpace":
@@ -165,6 +172,13 @@ class SearchSpace(StrictModel):
             if self.is_active(name, {parent: values[parent] for parent in kept}):
                 kept.add(name)
         return {name: values[name] for name in self.parameters if name in kept}
+
+    def making_active(self, name: str) -> dict[str, Value]:
+        """Values of other parameters with which a parameter is active: the first that each condition lists."""
+        values: dict[str, Value] = {}
+        for parent, listed in self.parameters[name].when.items():
+            values |= self.making_active(parent) | {parent: listed[0]}
+        return values
 
     def is_active(self, name: str, active: Mapping[str, Value]) -> bool:
         """Whether a parameter's conditions hold, given the active parameters among those that they name."""

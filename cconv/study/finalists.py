@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cconv.data.targets import Sample
-from cconv.errors import StudyError
+from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.metrics import (
     blocks_of_errors,
@@ -131,6 +131,8 @@ def retrained_finalists(
     retrained, failed = [], {}
     retrainings = run.retrainings()
     for finalist in finalists:
+        if finalist not in retrainings:
+            raise DataError(f"{run.path}: no retraining of {finalist!r} in finalists/; restore it, or run it again.")
         records = retrainings[finalist]
         lost = [record for record in records if record.outcome != "completed"]
         wanted = 1 if records[0].is_closed_form else num_seeds

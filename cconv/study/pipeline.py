@@ -9,7 +9,7 @@ from cconv.errors import ConfigError
 from cconv.study.ablation import ablate
 from cconv.study.baseline import train_baseline
 from cconv.study.closed_form import screen_closed_forms
-from cconv.study.config import StudyConfig
+from cconv.study.config import StudyConfig, recorded_study
 from cconv.study.convergence import train_longer
 from cconv.study.costs import CostCounter
 from cconv.study.environment import describe_environment
@@ -24,9 +24,9 @@ from cconv.study.records import FORMAT, RunFolder
 from cconv.study.search import adaptive_search, random_search, spend_otherwise
 from cconv.study.select import select
 from cconv.study.session import Progress, Session
-from cconv.study.space import SearchSpace, check_baseline_affordable, fixed
-from cconv.study.stages import readers_of
-from cconv.validation import validated
+from cconv.study.space import SearchSpace, check_baseline_affordable, fixed, recorded_space
+from cconv.study.stages import Trials, readers_of
+from cconv.validation import check_setting
 
 STAGES: Mapping[str, Callable[[Session, str], dict]] = {
     "closed_form": screen_closed_forms,
@@ -104,6 +104,7 @@ def extend_study(run: RunFolder, stage: str, trials: int) -> None:
         if getattr(settings, "trials", None) is None:
             searches = [name for name, each in study.stages.items() if hasattr(each, "trials")]
             raise ConfigError(f"{run.path}: no search {stage!r} to extend; searches: {', '.join(searches) or 'none'}.")
+        check_setting(Trials, settings.trials + trials, "--trials, with those of the study")
         extended = settings.model_copy(update={"trials": settings.trials + trials})
         study = study.model_copy(update={"stages": study.stages | {stage: extended}})
         write_study(run, study)
@@ -127,17 +128,6 @@ def write_study(run: RunFolder, study: StudyConfig) -> None:
     """Write study.json, with an id that tells the run from others of the same name in a database."""
     written = run.read("study.json") if (run.path / "study.json").is_file() else {"id": uuid.uuid4().hex[:8]}
     run.write("study.json", {"format": FORMAT, "id": written["id"], **study.model_dump(mode="json")})
-
-
-def recorded_study(run: RunFolder) -> StudyConfig:
-    """The study of a run folder."""
-    values = {key: value for key, value in run.read("study.json").items() if key not in ("format", "id")}
-    return validated(StudyConfig, values, run.path / "study.json")
-
-
-def recorded_space(run: RunFolder) -> SearchSpace:
-    """The search space of a run folder."""
-    return validated(SearchSpace, run.read("space.json"), run.path / "space.json")
 
 
 def _run_stage(session: Session, stage: str, kind: str) -> None:

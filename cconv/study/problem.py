@@ -12,7 +12,7 @@ from cconv.errors import ConfigError
 from cconv.sph.kernels import kernel_named
 from cconv.study.config import DataConfig, StudyConfig
 from cconv.training.field_model import FieldModel, NetworkConfig, build_field_model
-from cconv.validation import validated
+from cconv.validation import PathText, check_setting, validated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,12 @@ def open_study_data(data: DataConfig, data_seed: int) -> Dataset:
 
 
 def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
-    """The study on the data at `path`."""
+    """The study on the data at `path`.
+
+    Raises:
+        ConfigError: If study.json could not hold that path.
+    """
+    check_setting(PathText, path, "--data")
     return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
 
 

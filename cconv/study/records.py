@@ -4,18 +4,28 @@ import fcntl
 import json
 import math
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
-from cconv.errors import ConfigError, DataError
+from pydantic import BaseModel, Field, RootModel
+
+from cconv.errors import ConfigError, DataError, shown
+from cconv.files import parse_json, read_json, read_text
+from cconv.validation import Flag, Id, Name, OpenModel, Real, Value, Whole, check_setting, validated
 
 FORMAT = 2  # of a run folder; another one is refused
 DIVERGED_ERROR = 1e9  # Optuna needs a finite number where a trial diverged; our records hold none there
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
+KNOWN_BEFORE = ("init_seed", "num_parameters", "flops_per_particle")  # a training begins
+
+_Count = Annotated[Whole, Field(ge=0, lt=2**63)]
+_Error = Annotated[Real, Field(ge=0)]
 
 
 def write_json(path: Path, value) -> None:
@@ -34,18 +44,130 @@ def write_text(path: Path, text: str) -> None:
         part.unlink(missing_ok=True)
 
 
-def read_json(path: Path):
-    """Content of a JSON file.
+class _Entry(OpenModel):
+    """A line of log.jsonl."""
+
+    updates: _Count
+    valid_normalized_mse: _Error | None
+    seconds: _Error
+    train_loss: _Error | None = None
+    learning_rate: Real | None = None
+    diverged: Flag = False
+
+
+class _Config(OpenModel):
+    """config.json of a training; what costs nothing was known before it began, the rest is None where it failed."""
+
+    stage: Name
+    parameters: dict[str, Value]
+    init_seed: Annotated[Whole, Field(ge=0, lt=2**32)] | None = None
+    num_parameters: _Count | None = None
+    flops_per_particle: _Error | None = None
+    closed_form: Flag = False
+
+
+class _Outcome(OpenModel):
+    """outcome.json of a training."""
+
+    outcome: Literal[OUTCOMES]
+    reason: str
+
+
+class _StageSettings(OpenModel):
+    """A stage in study.json."""
+
+    kind: str
+
+
+class _Study(OpenModel):
+    """study.json, as far as a reader of records needs it."""
+
+    format: _Count = 1
+    id: Annotated[str, Field(pattern=r"^[0-9a-f]{1,64}$")] = "0"
+    name: Name = "study"
+    stages: Annotated[dict[Name, _StageSettings], Field(min_length=1, max_length=100)]
+
+
+class _State(OpenModel):
+    """state.json."""
+
+    state: Literal["running", "finished", "interrupted", "failed"]
+    stage: Name
+
+
+class _Rung(OpenModel):
+    """A rung of a stage in rungs.json."""
+
+    updates: _Count
+    recorded: dict[str, _Error]
+
+
+class _Rungs(RootModel):
+    """rungs.json."""
+
+    root: dict[Name, list[_Rung]]
+
+
+class _Table(RootModel):
+    """Any other file."""
+
+    root: dict
+
+
+class _Result(OpenModel):
+    """What a stage has found, in stages/."""
+
+    kind: str
+    seconds: _Error
+    finalists: dict[Id, dict[str, Value]] = {}
+
+
+class _Model(OpenModel):
+    """The recommended model in summary.json."""
+
+    id: Id
+    reason: str
+
+
+class _Finalist(OpenModel):
+    """A finalist in summary.json."""
+
+    id: Id
+    num_parameters: _Count
+    config: dict
+    test: dict
+    cost: dict
+    stability: dict | None
+
+
+class _Summary(OpenModel):
+    """summary.json, as far as every reader needs it."""
+
+    study: Name
+    baseline: Name
+    recommended: _Model
+    finalists: Annotated[list[_Finalist], Field(min_length=1)]
+    pareto_front: list[Id]
+    wall_seconds: _Error
+
+
+_FORMS = {"study.json": _Study, "state.json": _State, "rungs.json": _Rungs, "summary.json": _Summary}
+
+
+def read_record(path: Path, form: type[BaseModel] = _Table):
+    """Content of a JSON file that fits a form.
 
     Raises:
-        DataError: If the file is missing or damaged.
+        DataError: If the file is missing or damaged, or a key or value does not fit.
     """
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file; give the folder of a study run.") from error
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}: not JSON ({error}); restore the file or run the study again.") from error
+    content = read_json(path)
+    validated(form, content, path, DataError)
+    return content
+
+
+def read_rungs(path: Path) -> dict[str, list[dict]]:
+    """Rungs of every stage that has any, from rungs.json."""
+    return read_record(path, _Rungs) if path.exists() else {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +230,7 @@ class TrialFolder:
     @property
     def parameters(self) -> dict | None:
         """Hyperparameters of the configuration; None before it has been written."""
-        return read_json(self.path / "config.json")["parameters"] if self.started else None
+        return read_record(self.path / "config.json", _Config)["parameters"] if self.started else None
 
     def check_begun_with(self, parameters: Mapping) -> None:
         """Raise `ConfigError` if the trial was begun with other hyperparameters."""
@@ -148,7 +270,7 @@ class TrialFolder:
     def log(self) -> list[dict]:
         """Evaluations so far; a last line cut short by a kill is left out."""
         path = self.path / "log.jsonl"
-        lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
+        lines = read_text(path).splitlines() if path.exists() else []
         if lines and not lines[-1].endswith("}"):
             lines.pop()
         return [self._entry(path, number, line) for number, line in enumerate(lines, start=1)]
@@ -156,10 +278,10 @@ class TrialFolder:
     @staticmethod
     def _entry(path: Path, number: int, line: str) -> dict:
         try:
-            entry = json.loads(line)
-            entry["updates"], entry["valid_normalized_mse"], entry["seconds"]  # noqa: B018, what every reader needs
-        except (ValueError, TypeError, KeyError) as error:
+            entry = parse_json(line)
+        except ValueError as error:
             raise DataError(f"{path}: line {number} is no evaluation's record ({error}); delete that line.") from error
+        validated(_Entry, entry, f"{path}: line {number} is no evaluation's record; delete that line", DataError)
         return entry
 
     def read(self) -> TrialRecord:
@@ -168,8 +290,10 @@ class TrialFolder:
         Raises:
             DataError: If a file is damaged.
         """
-        config = read_json(self.path / "config.json")
-        end = read_json(self.path / "outcome.json") if self.ended else {"outcome": "interrupted", "reason": ""}
+        config = dict.fromkeys(KNOWN_BEFORE) | read_record(self.path / "config.json", _Config)
+        end = {"outcome": "interrupted", "reason": ""}
+        if self.ended:
+            end = read_record(self.path / "outcome.json", _Outcome)
         return TrialRecord(
             id=self.path.name,
             stage=config["stage"],
@@ -219,7 +343,7 @@ class RunFolder:
         run = cls(path)
         if not (run.path / "study.json").is_file():
             raise DataError(f"{run.path}: no study.json; give the folder that `cconv study run` printed.")
-        written = run.read("study.json").get("format", 1)
+        written = read_record(run.path / "study.json").get("format", 1)
         if written != FORMAT:
             raise DataError(
                 f"{run.path}: a run folder of format {written}, and this version of cconv reads format {FORMAT}; "
@@ -245,23 +369,38 @@ class RunFolder:
 
     def trial(self, trial_id: str) -> TrialFolder:
         """Folder of a search trial."""
-        return TrialFolder(self.path / "trials" / trial_id)
+        return TrialFolder(self.path / "trials" / checked_id(trial_id))
 
     def finalist(self, finalist_id: str, seed: int) -> TrialFolder:
         """Folder of one retraining of a finalist."""
-        return TrialFolder(self.path / "finalists" / finalist_id / f"seed_{seed}")
+        return TrialFolder(self.path / "finalists" / checked_id(finalist_id) / f"seed_{seed:d}")
 
     def trials(self) -> list[TrialRecord]:
         """Records of all search trials, stage after stage, in the order in which they were drawn."""
-        stages = [*self.read("study.json")["stages"]]
-        records = [TrialFolder(config.parent).read() for config in (self.path / "trials").glob("*/config.json")]
-        return sorted(records, key=lambda record: (stages.index(record.stage), record.id))
+        return [record for stage in self.read("study.json")["stages"] for record in self.trials_of(stage)]
 
     def trials_of(self, stage: str) -> list[TrialRecord]:
-        """Records of one stage's trials, in the order in which they were drawn."""
-        folders = sorted((self.path / "trials").glob(f"{stage}_[0-9]*/config.json"))
-        records = [TrialFolder(config.parent).read() for config in folders]
-        return [record for record in records if record.stage == stage]
+        """Records of one stage's trials, in the order in which they were drawn.
+
+        Raises:
+            DataError: If a record is damaged, or that of a trial of another stage.
+        """
+        name = re.compile(rf"{re.escape(stage)}_(\d{{4,}})")
+        matches = [name.fullmatch(folder.name) for folder in _folders(self.path / "trials")]
+        numbered = sorted((int(match[1]), match[0]) for match in matches if match)
+        folders = [self.trial(trial) for _, trial in numbered]
+        records = [folder.read() for folder in folders if folder.started]
+        for record in records:
+            self._check_trial(record, stage)
+        return records
+
+    def _check_trial(self, record: TrialRecord, stage: str) -> None:
+        path = self.trial(record.id).path / "config.json"
+        if record.stage != stage:
+            raise DataError(f"{path}: `stage` must be {stage!r}, got {shown(record.stage)}; restore the file.")
+        for name in KNOWN_BEFORE:  # None where it failed before it began
+            if record.log and record.config[name] is None:
+                raise DataError(f"{path}: `{name}` is missing, though the trial was evaluated; restore the file.")
 
     def has_result(self, stage: str) -> bool:
         """Whether a stage has come to its end."""
@@ -278,8 +417,14 @@ class RunFolder:
     def retrainings(self) -> dict[str, list[TrialRecord]]:
         """Records of all retrainings, by finalist."""
         records: dict[str, list[TrialRecord]] = {}
-        for config in sorted((self.path / "finalists").glob("*/seed_*/config.json")):
-            records.setdefault(config.parent.parent.name, []).append(TrialFolder(config.parent).read())
+        for finalist in _folders(self.path / "finalists"):
+            seeds = [TrialFolder(folder) for folder in _folders(finalist) if re.fullmatch(r"seed_\d+", folder.name)]
+            read = [folder.read() for folder in seeds if folder.started]
+            for record in read:
+                if record.config["init_seed"] not in (None, int(record.id.removeprefix("seed_"))):
+                    raise DataError(f"{finalist / record.id}/config.json: `init_seed` is not that of the folder.")
+            if read:
+                records[checked_id(finalist.name)] = read
         return records
 
     def write(self, name: str, value) -> None:
@@ -287,12 +432,30 @@ class RunFolder:
         write_json(self.path / name, value)
 
     def read(self, name: str):
-        """Read a JSON file of the run folder."""
-        return read_json(self.path / name)
+        """Read a JSON file of the run folder.
+
+        Raises:
+            DataError: If it is missing or damaged, or a key or value does not fit.
+        """
+        return read_record(self.path / name, _Result if name.startswith("stages/") else _FORMS.get(name, _Table))
 
     def set_state(self, state: str, stage: str) -> None:
         """Record whether the run is "running", "finished", "interrupted" or "failed", and in which stage."""
         self.write("state.json", {"state": state, "stage": stage})
+
+
+def checked_id(name: str) -> str:
+    """The id of a trial or finalist, which becomes a folder.
+
+    Raises:
+        ConfigError: If it could lead out of the folder of all of them.
+    """
+    check_setting(Id, name, "the id of a training")
+    return name
+
+
+def _folders(path: Path) -> list[Path]:
+    return sorted(folder for folder in path.iterdir() if folder.is_dir()) if path.is_dir() else []
 
 
 def count_outcomes(records: Sequence[TrialRecord]) -> dict[str, dict[str, int]]:

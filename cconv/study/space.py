@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from cconv.errors import ConfigError, did_you_mean
+from cconv.errors import ConfigError, DataError, did_you_mean, shown
 from cconv.evaluation.cost_model import Estimate
-from cconv.study.config import TrainingConfig, read_toml
+from cconv.files import read_toml
+from cconv.study.config import HYPERPARAMETERS, StudyConfig, TrainingConfig, configure
 from cconv.study.domains import Choice, FloatRange, IntRange, Parameter, SearchSpace, Value, fixed, narrowed
+from cconv.study.records import RunFolder
 from cconv.training.field_model import NetworkConfig
 from cconv.validation import validated
 
@@ -21,41 +21,69 @@ __all__ = [
     "SearchSpace",
     "Value",
     "check_baseline_affordable",
+    "check_possible",
     "configure",
     "fixed",
     "load_space",
     "narrowed",
+    "recorded_space",
 ]
 
-TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
-HYPERPARAMETERS = (*NetworkConfig.model_fields, *TRAINING_HYPERPARAMETERS)
 
-
-def load_space(path: Path | str) -> SearchSpace:
+def load_space(path: Path | str, study: StudyConfig | None = None) -> SearchSpace:
     """Search space from a TOML file.
+
+    Args:
+        path: The file.
+        study: The study whose settings the space varies; the defaults if None.
 
     Raises:
         ConfigError: If the file cannot be read, names no hyperparameter of ours, or a value, condition or the baseline
             is impossible.
     """
     space = validated(SearchSpace, read_toml(path), path)
-    for name, parameter in space.parameters.items():
-        if name not in HYPERPARAMETERS:
-            raise ConfigError(
-                f"{path}: unknown hyperparameter `parameters.{name}`.{did_you_mean(name, HYPERPARAMETERS)} "
-                f"Known: {', '.join(HYPERPARAMETERS)}."
-            )
-        for value in parameter.extremes:
-            _check_possible({name: value}, f"{path}: `parameters.{name}`: the value {value!r}")
-    _check_possible(space.baseline, f"{path}: the baseline")
+    check_possible(space, path, study)
     return space
 
 
-def _check_possible(parameters: Mapping[str, Value], what: str) -> None:
+def recorded_space(run: RunFolder) -> SearchSpace:
+    """The search space of a run folder.
+
+    Raises:
+        DataError: If its space.json is damaged.
+    """
+    return validated(SearchSpace, run.read("space.json"), run.path / "space.json", DataError)
+
+
+def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | None = None) -> None:
+    """Check that every parameter is a hyperparameter, and that its values and the baseline are possible.
+
+    Args:
+        space: The search space.
+        source: Where it comes from, for the message.
+        study: The study whose settings the space varies; the defaults if None.
+
+    Raises:
+        ConfigError: With the parameter and the value.
+    """
+    settings = (study.network, study.training) if study else (NetworkConfig(), TrainingConfig())
+    for name, parameter in space.parameters.items():
+        if name not in HYPERPARAMETERS:
+            raise ConfigError(
+                f"{source}: unknown hyperparameter `parameters.{name}`.{did_you_mean(name, HYPERPARAMETERS)} "
+                f"Known: {', '.join(HYPERPARAMETERS)}."
+            )
+        for value in parameter.extremes:
+            values = space.making_active(name) | {name: value}
+            _check_configures(values, settings, f"{source}: `parameters.{name}`: the value {shown(value)}")
+    _check_configures(space.baseline, settings, f"{source}: the baseline")
+
+
+def _check_configures(parameters: Mapping[str, Value], settings: tuple, what: str) -> None:
     try:
-        configure(parameters, NetworkConfig(), TrainingConfig())
-    except ValidationError as error:
-        raise ConfigError(f"{what} is not possible ({error.errors()[0]['msg']}).") from error
+        configure(parameters, *settings)
+    except ConfigError as error:
+        raise ConfigError(f"{what} is {error}.") from error
 
 
 def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str, Value]], Estimate]) -> None:
@@ -75,15 +103,3 @@ def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str
                 f"search space {space.name!r}: its baseline costs {cost:.3g} {name.replace('_', ' ')} in this scene, "
                 f"above `max_{name}` = {cap:.3g}; raise the cap or take a cheaper baseline."
             )
-
-
-def configure(
-    parameters: Mapping[str, Value], network: NetworkConfig, training: TrainingConfig
-) -> tuple[NetworkConfig, TrainingConfig]:
-    """Network and training settings with the drawn hyperparameters in place of the study's own."""
-    drawn = {name: value for name, value in parameters.items() if name in TRAINING_HYPERPARAMETERS}
-    shape = {name: value for name, value in parameters.items() if name not in TRAINING_HYPERPARAMETERS}
-    return (
-        NetworkConfig.model_validate(network.model_dump() | shape),
-        TrainingConfig.model_validate(training.model_dump() | drawn),
-    )

@@ -1,12 +1,17 @@
 """The stages that a study file declares, in the order in which they run, and which earlier ones each of them reads."""
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
 from cconv.errors import did_you_mean
-from cconv.validation import StrictModel, Value
+from cconv.validation import Name, Real, StrictModel, Value, Whole
+
+MOST_TRIALS = 100_000  # of a search
+Ridge = Annotated[Real, Field(ge=0, le=1e6)]  # weight of the squared coefficients, in mean squares of a term
+Trials = Annotated[Whole, Field(ge=1, le=MOST_TRIALS)]
 
 BASELINE = "baseline"  # id of the published network among the finalists
 
@@ -14,7 +19,7 @@ BASELINE = "baseline"  # id of the published network among the finalists
 class _Stage(StrictModel):
     """`reads` names the stages whose records it uses; None means every earlier one of a kind that it can use."""
 
-    reads: tuple[str, ...] | None = None
+    reads: tuple[Name, ...] | None = None
 
 
 class ClosedFormStage(_Stage):
@@ -25,11 +30,11 @@ class ClosedFormStage(_Stage):
     """
 
     kind: Literal["closed_form"]
-    count: int = Field(3, ge=1)
-    max_candidates: int = Field(200, ge=1)
-    screening_frames: int = Field(4, ge=1)
-    values_per_range: int = Field(3, ge=2)
-    ridge: float = Field(1e-10, ge=0)
+    count: Whole = Field(3, ge=1, le=1000)
+    max_candidates: Whole = Field(200, ge=1, le=10_000)
+    screening_frames: Whole = Field(4, ge=1, le=10_000)
+    values_per_range: Whole = Field(3, ge=2, le=100)
+    ridge: Ridge = 1e-10
 
 
 class InitializationStage(_Stage):
@@ -39,8 +44,8 @@ class InitializationStage(_Stage):
     """
 
     kind: Literal["initialization"]
-    seeds: int = Field(5, ge=2)
-    configurations: int = Field(16, ge=2)
+    seeds: Whole = Field(5, ge=2, le=1000)
+    configurations: Whole = Field(16, ge=2, le=MOST_TRIALS)
 
 
 class BaselineStage(_Stage):
@@ -53,16 +58,16 @@ class RandomStage(_Stage):
     """Random search with ASHA, in the study's space or in the one that the stage `space` refined."""
 
     kind: Literal["random"]
-    trials: int = Field(16, ge=1)
-    space: str | None = None
+    trials: Trials = 16
+    space: Name | None = None
 
 
 class AdaptiveStage(_Stage):
     """Tree-structured Parzen estimator with ASHA for error and cost, which learns from the stages that it reads."""
 
     kind: Literal["adaptive"]
-    trials: int = Field(16, ge=1)
-    space: str | None = None
+    trials: Trials = 16
+    space: Name | None = None
 
 
 class ReferenceStage(_Stage):
@@ -84,8 +89,8 @@ class FinalistsStage(_Stage):
     """
 
     kind: Literal["finalists"]
-    count: int = Field(3, ge=1)
-    include: dict[str, dict[str, Value]] = {}
+    count: Whole = Field(3, ge=1, le=1000)
+    include: dict[Name, dict[str, Value]] = Field({}, max_length=100)
 
 
 class ImportanceStage(_Stage):
@@ -98,7 +103,7 @@ class AblationStage(_Stage):
     """Retrainings between the baseline and the best finalist, and of the best finalist without each of its parts."""
 
     kind: Literal["ablation"]
-    seeds: int = Field(1, ge=1)
+    seeds: Whole = Field(1, ge=1, le=1000)
 
 
 class ConvergeStage(_Stage):
@@ -108,8 +113,8 @@ class ConvergeStage(_Stage):
     """
 
     kind: Literal["converge"]
-    budgets: tuple[Annotated[int, Field(ge=1, le=10_000_000)], ...] = Field(min_length=1, max_length=20)
-    of: tuple[str, ...] | None = None
+    budgets: tuple[Annotated[Whole, Field(ge=1, le=10_000_000)], ...] = Field(min_length=1, max_length=20)
+    of: tuple[Name, ...] | None = None
 
     @field_validator("budgets")
     @classmethod
@@ -166,6 +171,9 @@ NEEDS = {
     "select",
 }  # idle without a stage to read
 
+RESERVED = {"data", "train"}  # records say so where no stage of a study is meant
+BASELINES = {"baseline"}  # ids of finalists that no study file gives
+
 
 def default_stages() -> dict[str, StrictModel]:
     """The shortest study that answers: closed forms, a random search, finalists, selection."""
@@ -192,6 +200,33 @@ def readers_of(stages: Mapping[str, StrictModel], name: str) -> set[str]:
         if reached & {*reads_of(stages, other), getattr(stage, "space", None)}:
             reached.add(other)
     return reached - {name}
+
+
+def check_names(stages: Mapping[str, StrictModel]) -> None:
+    """Check that no name of a stage or of a finalist can be taken for another's, in the records or by a reader.
+
+    Raises:
+        ValueError: With the name and what it could be taken for.
+    """
+    for name, stage in stages.items():
+        if name in RESERVED or (name in USES and name != stage.kind):
+            raise ValueError(f"stage `{name}` must have another name: that one is kept for what it is called after")
+        like = [other for other in stages if other != name and name.casefold() == other.casefold()]
+        like += [other for other in stages if re.fullmatch(rf"{re.escape(other)}_\d+", name)]
+        if like:
+            raise ValueError(f"stage `{name}` could be taken for stage `{like[0]}` or one of its trials; rename it")
+    known: dict[str, dict] = {}
+    for finalist, parameters in included(stages):
+        like = [stage for stage in stages if finalist.startswith(f"{stage}_")]
+        if like:
+            raise ValueError(f"finalist `{finalist}` could be taken for a trial of stage `{like[0]}`; rename it")
+        if finalist in BASELINES or known.setdefault(finalist, parameters) != parameters:
+            raise ValueError(f"finalist `{finalist}` must have another name: that one is another configuration's")
+
+
+def included(stages: Mapping[str, StrictModel]) -> list[tuple[str, dict[str, Value]]]:
+    """Ids and hyperparameters of the configurations that the stages include by name."""
+    return [each for stage in stages.values() for each in getattr(stage, "include", {}).items()]
 
 
 def check_order(stages: Mapping[str, StrictModel]) -> None:

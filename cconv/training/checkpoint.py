@@ -3,17 +3,31 @@
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
 
 from cconv.data.features import Standardization
-from cconv.errors import ConfigError
-from cconv.training.field_model import FieldConfig, FieldModel
+from cconv.data.targets import target_channels
+from cconv.errors import ConfigError, shown
+from cconv.files import read_json
+from cconv.training.field_model import FieldConfig, FieldModel, check_size
+from cconv.validation import OpenModel, Real, Seed, validated
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
+LARGEST_HEADER = 2**20  # bytes of a weights file's list of contents
+
+
+class _Card(OpenModel):
+    """What others read of a card."""
+
+    data: dict = {}
+    data_seed: Seed = 0
+    valid_normalized_mse: Real | None = None
 
 
 def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
@@ -61,25 +75,57 @@ def load_model(path: Path | str, task: str | None = None) -> FieldModel:
             raise ConfigError(
                 f"{folder}: no {name}; give a checkpoint folder, e.g. runs/<study>/finalists/<id>/seed_0."
             )
-    config = _read_config(folder / CONFIG)
+    config = validated(FieldConfig, read_json(folder / CONFIG, error=ConfigError), folder / CONFIG)
     if task is not None and config.task != task:
         raise ConfigError(
-            f"{folder}: the model is for task {config.task!r}, not {task!r}; give a checkpoint of that task."
+            f"{folder}: the model is for task {config.task!r}, not {shown(task)}; give a checkpoint of that task."
         )
-    try:
-        tensors = load_file(folder / WEIGHTS)
-    except (SafetensorError, OSError) as error:
-        raise ConfigError(f"{folder / WEIGHTS}: damaged weights ({error}); copy or train the model again.") from error
-    try:
-        features, targets = (
-            Standardization(tensors[f"{name}_mean"], tensors[f"{name}_scale"]) for name in ("feature", "target")
-        )
-        model = FieldModel(config, features, targets)
-        model.load_state_dict(tensors)
-    except (KeyError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"{folder}: weights and {CONFIG} do not belong together ({reason}).") from error
+    tensors = _read_weights(folder, config)
+    features, targets = (
+        Standardization(tensors[f"{name}_mean"], tensors[f"{name}_scale"]) for name in ("feature", "target")
+    )
+    model = FieldModel(config, features, targets)
+    model.load_state_dict(tensors)
     return model.eval()
+
+
+def _read_weights(folder: Path, config: FieldConfig) -> dict[str, Tensor]:
+    """The weights of a model, whose names and shapes are compared before any of them is read."""
+    path = folder / WEIGHTS
+    wanted = _shapes(config)
+    try:
+        with path.open("rb") as file:
+            if int.from_bytes(file.read(8), "little") > LARGEST_HEADER:
+                raise SafetensorError("its list of contents is too long")
+        with safe_open(path, framework="pt") as file:
+            slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
+            shapes = {name: (tuple(each.get_shape()), each.get_dtype()) for name, each in slices.items()}
+            wrong = sorted(name for name in wanted | shapes if wanted.get(name) != shapes.get(name))
+            if wrong:
+                found, want = shapes.get(wrong[0], "nothing"), wanted.get(wrong[0], "nothing")
+                raise ConfigError(
+                    f"{folder}: weights and {CONFIG} do not belong together ({shown(wrong[0])} is {found} in the "
+                    f"weights, and {want} by the settings); copy or train the model again."
+                )
+            tensors = {name: file.get_tensor(name) for name in wanted}
+    except (SafetensorError, OSError) as error:
+        raise ConfigError(f"{path}: damaged weights ({error}); copy or train the model again.") from error
+    _check_numbers(path, tensors)
+    return tensors
+
+
+def _shapes(config: FieldConfig) -> dict[str, tuple]:
+    """Shape and type of every tensor of a model's weights."""
+    channels = (config.feature_channels, target_channels(config.task, config.dim))
+    features, targets = (Standardization(torch.empty(count), torch.empty(count)) for count in channels)
+    hollow = check_size(config, features, targets)
+    return {name: (tuple(tensor.shape), "F32") for name, tensor in hollow.state_dict().items()}
+
+
+def _check_numbers(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all() or (name.endswith("_scale") and not (tensor > 0).all()):
+            raise ConfigError(f"{path}: {name!r} holds values that are not finite, or no scale; train the model again.")
 
 
 def read_card(path: Path | str) -> dict:
@@ -89,18 +135,8 @@ def read_card(path: Path | str) -> dict:
         ConfigError: If the card is damaged.
     """
     card = Path(path) / CARD
-    if not card.is_file():
+    if not card.exists():
         return {}
-    try:
-        return dict(json.loads(card.read_text()))
-    except ValueError as error:
-        raise ConfigError(f"{card}: not a JSON table ({error}); restore or delete it.") from error
-
-
-def _read_config(path: Path) -> FieldConfig:
-    try:
-        return FieldConfig.model_validate_json(path.read_text())
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path}: {where or 'file'}: {first['msg']}; this is not a model of this version.") from error
+    content = read_json(card, error=ConfigError)
+    validated(_Card, content, card)
+    return content

@@ -21,11 +21,14 @@ from cconv.data.features import standardize_vectors as standardize_targets
 from cconv.data.targets import VECTOR_TASKS, Sample, target_channels
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
-from cconv.errors import ShapeError
+from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import Edges, radius_graph
 from cconv.nn import ConvGeometry, ConvNet, RadialGeometry, RadialNet
 from cconv.ops.workers import results_of
-from cconv.sph.kernels import kernel_named
+from cconv.sph.kernels import KERNELS, kernel_named
+from cconv.validation import Flag, Length, Real, Whole
+
+MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
 
 
 class NetworkConfig(BaseModel):
@@ -42,26 +45,26 @@ class NetworkConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    layers: int = Field(4, ge=1, le=16)
-    first_channels: int = Field(32, ge=1)
-    hidden_channels: int = Field(64, ge=1)
+    layers: Whole = Field(4, ge=1, le=16)
+    first_channels: Whole = Field(32, ge=1, le=4096)
+    hidden_channels: Whole = Field(64, ge=1, le=4096)
     basis: Literal["grid", "radial"] = "grid"
-    radial_terms: int = Field(16, ge=1, le=512)
-    kernel_size: int = Field(4, ge=1, le=32)
-    relative_cutoff: float = Field(2.25, gt=0, le=10)
+    radial_terms: Whole = Field(16, ge=1, le=512)
+    kernel_size: Whole = Field(4, ge=1, le=32)
+    relative_cutoff: Real = Field(2.25, ge=1e-3, le=10)
     mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (
         "ball_to_cube_volume_preserving"
     )
     window: Literal["none", "poly6", "gaussian", "cubic_spline"] = "poly6"
     interpolation: Literal["linear", "nearest_neighbor", "linear_border"] = "linear"
-    align_corners: bool = True
-    normalize: bool = False
+    align_corners: Flag = True
+    normalize: Flag = False
     message: Literal["absolute", "difference"] = "absolute"
     activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
-    boundary: bool = True
-    density: bool = True
+    boundary: Flag = True
+    density: Flag = True
 
     @model_validator(mode="after")
     def _skip_fits_basis(self) -> "NetworkConfig":
@@ -84,11 +87,11 @@ class FieldConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     task: Literal["density_rate", "density_gradient"]
-    dim: int = Field(ge=1, le=3)
-    particle_spacing: float = Field(gt=0)
-    kernel: str
-    smoothing_length: float = Field(gt=0)
-    boundary_channels: int = Field(ge=0)
+    dim: Whole = Field(ge=1, le=3)
+    particle_spacing: Length
+    kernel: Literal[tuple(KERNELS)]
+    smoothing_length: Length
+    boundary_channels: Whole = Field(ge=0, le=3)
     network: NetworkConfig
 
     @property
@@ -301,4 +304,22 @@ def build_field_model(
     features = standardize_features((sample.inputs.features for sample in train_samples), center_velocity=not turns)
     center = not (turns and task in VECTOR_TASKS)
     targets = standardize_targets((sample.target for sample in train_samples), center)
-    return FieldModel(config, features.first(config.feature_channels), targets, generator)
+    features = features.first(config.feature_channels)
+    check_size(config, features, targets)
+    return FieldModel(config, features, targets, generator)
+
+
+def check_size(config: FieldConfig, features: Standardization, targets: Standardization) -> FieldModel:
+    """A model without weights, which takes no memory, to see what it would have; arguments as of `FieldModel`.
+
+    Raises:
+        ConfigError: If it would have more than `MOST_PARAMETERS` learned values.
+    """
+    with torch.device("meta"):
+        hollow = FieldModel(config, features, targets)
+    if hollow.num_parameters > MOST_PARAMETERS:
+        raise ConfigError(
+            f"the network would have {hollow.num_parameters:,} learned values, more than {MOST_PARAMETERS:,}; lower "
+            "`kernel_size`, `radial_terms`, `first_channels`, `hidden_channels` or `layers`."
+        )
+    return hollow

@@ -6,11 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from pydantic import Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from cconv.errors import DataError
+from cconv.files import parse_json
 from cconv.training.field_model import FieldModel
+from cconv.validation import Real, StrictModel, Whole
+
+
+class _Counts(StrictModel):
+    updates: Whole = Field(ge=0)
+    seconds: Real = Field(ge=0)
 
 
 @dataclass
@@ -57,7 +65,7 @@ def load_progress(path: Path, model: FieldModel) -> Progress:
     progress = begin(model)
     try:
         with safe_open(path, framework="pt") as file:
-            counts = json.loads(file.metadata()["counts"])
+            counts = _Counts.model_validate(parse_json((file.metadata() or {})["counts"]))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
         prefix = "weights."
         weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
@@ -65,9 +73,11 @@ def load_progress(path: Path, model: FieldModel) -> Progress:
         for name, parameter in model.named_parameters():
             if f"adam.step.{name}" in tensors:  # one that no loss depends on has none
                 moments = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+                if not all(moments[key].shape == parameter.shape for key in ("exp_avg", "exp_avg_sq")):
+                    raise ValueError(f"moments of {name} have another shape")
                 progress.optimizer.state[parameter] = moments
-    except (SafetensorError, RuntimeError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, RuntimeError, KeyError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{path}: no progress of this training ({reason}); delete it to begin again.") from error
-    progress.updates, progress.seconds = counts["updates"], counts["seconds"]
+    progress.updates, progress.seconds = counts.updates, counts.seconds
     return progress

@@ -38,7 +38,7 @@ def test_a_gain_within_the_margin_is_none(errors, falls):
 
 
 def test_the_words_name_both_budgets_and_whether_the_error_still_falls():
-    ends = [point("baseline", 162, 0.57), point("baseline_6000", 6000, 0.166)]
+    ends = [point("baseline", 162, 0.57), point("baseline_after_6000", 6000, 0.166)]
     found = {"baseline": {"points": ends, "still_falling": True}}
     words = budget_words([], found, 0.05)
     assert "162 updates decided the error of baseline, 0.57: after 6,000 updates it is 0.166" in words
@@ -54,7 +54,7 @@ def test_a_finalist_whose_error_was_still_falling_is_named_unless_a_larger_budge
         {"id": "steep", "updates": 162, "fall_at_the_end": 0.3},
     ]
     found = {
-        "baseline": {"points": [point("baseline", 162, 0.5), point("baseline_600", 600, 0.4)], "still_falling": False}
+        "baseline": {"points": [point("baseline", 162, 0.5), point("baseline_after_600", 600, 0.4)], "still_falling": False}
     }
     words = budget_words(entries, found, 0.05)
     assert "steep (by 30% in the last quarter of its 162 updates)" in words

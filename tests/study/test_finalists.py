@@ -1,5 +1,6 @@
 import pytest
 
+from cconv.errors import DataError
 from cconv.study.finalists import Finalist, finalist_jobs, retrained_finalists
 from cconv.study.records import RunFolder
 
@@ -54,3 +55,8 @@ def test_a_finalist_with_a_lost_seed_is_not_compared_and_said(outcome, run):
 def test_a_finalist_with_too_few_seeds_is_not_compared(run):
     retrain(run, "a", 1)
     assert retrained_finalists(run, ["a"], 2) == ([], {"a": "only 1 of 2 seeds were trained"})
+
+
+def test_a_finalist_without_any_retraining_is_named(run):
+    with pytest.raises(DataError, match="no retraining of 'lost' in finalists/"):
+        retrained_finalists(run, ["lost"], 2)

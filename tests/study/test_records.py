@@ -5,7 +5,13 @@ import pytest
 from cconv.errors import ConfigError, DataError
 from cconv.study.records import FORMAT, RunFolder, write_json
 
-CONFIG = {"stage": "random", "parameters": {"kernel_size": 4}, "num_parameters": 12, "init_seed": 0}
+CONFIG = {
+    "stage": "random",
+    "parameters": {"kernel_size": 4},
+    "num_parameters": 12,
+    "flops_per_particle": 9.0,
+    "init_seed": 0,
+}
 STUDY = {"format": FORMAT, "stages": {"random": {"kind": "random"}}}
 ENTRY = {"updates": 5, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
@@ -114,3 +120,116 @@ def test_what_was_logged_after_the_progress_is_dropped(tmp_path):
         trial.append(ENTRY | {"updates": updates})
     trial.go_on(10)
     assert [entry["updates"] for entry in trial.log()] == [5, 10]
+
+
+def recorded(tmp_path, *stages):
+    """A run folder with a trial of each stage."""
+    run = RunFolder(tmp_path)
+    run.write("study.json", {"format": FORMAT, "stages": {stage: {"kind": "random"} for stage in stages}})
+    for stage in stages:
+        trial = run.trial(f"{stage}_0000")
+        trial.start(CONFIG | {"stage": stage})
+        trial.append(ENTRY)
+        trial.finish("completed")
+    return run
+
+
+def test_trials_are_told_by_their_whole_name(tmp_path):
+    run = recorded(tmp_path, "random", "random_wide", "r.ndom")
+    assert [record.id for record in run.trials()] == ["random_0000", "random_wide_0000", "r.ndom_0000"]
+    assert [record.id for record in run.trials_of("r.ndom")] == ["r.ndom_0000"]
+    assert run.trials_of("r[a-z]*") == []
+
+
+def test_trials_beyond_the_ten_thousandth_keep_their_order(tmp_path):
+    run = recorded(tmp_path, "random")
+    for number in (9999, 10_000):
+        run.trial(f"random_{number}").start(CONFIG)
+    assert [record.id for record in run.trials()] == ["random_0000", "random_9999", "random_10000"]
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc", "a/b", "", "..", "a..b"])
+def test_no_name_of_a_training_leads_out_of_the_run_folder(name, tmp_path):
+    for folder in (RunFolder(tmp_path).trial, lambda name: RunFolder(tmp_path).finalist(name, 1)):
+        with pytest.raises(ConfigError, match="a name must match"):
+            folder(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("trials/random_0000/config.json", {"stage": "random"}, "config.json: `parameters` is missing"),
+        ("trials/random_0000/config.json", CONFIG | {"stage": "other"}, "`stage` must be 'random', got 'other'"),
+        ("trials/random_0000/config.json", CONFIG | {"init_seed": "../.."}, "`init_seed`: input should be a valid int"),
+        ("trials/random_0000/config.json", CONFIG | {"parameters": [1]}, "`parameters`: input should be a valid dict"),
+        ("trials/random_0000/config.json", CONFIG | {"flops_per_particle": None}, "`flops_per_particle` is missing"),
+        ("trials/random_0000/config.json", [], "config.json: input should be a valid dictionary"),
+        ("trials/random_0000/outcome.json", {"outcome": "won", "reason": ""}, "outcome.json: `outcome`"),
+        ("trials/random_0000/outcome.json", {"outcome": "failed", "reason": 3}, "outcome.json: `reason`"),
+        ("trials/random_0000/log.jsonl", ENTRY | {"updates": "5"}, "log.jsonl: line 1 .*`updates`"),
+        ("trials/random_0000/log.jsonl", ENTRY | {"seconds": [1]}, "log.jsonl: line 1 .*`seconds`"),
+        ("trials/random_0000/log.jsonl", ENTRY | {"updates": True}, "log.jsonl: line 1 .*`updates`"),
+        ("study.json", {"format": FORMAT, "stages": {"../evil": {"kind": "random"}}}, "a name must match"),
+        ("study.json", {"format": FORMAT, "stages": ["random"]}, "study.json: `stages`: input should be a valid dict"),
+    ],
+)
+def test_a_record_that_does_not_fit_is_named_with_its_key(name, content, message, tmp_path):
+    run = recorded(tmp_path, "random")
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(DataError, match=message) as refused:
+        run.trials()
+    assert str(tmp_path / name) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("state.json", {"state": "running"}, "`stage` is missing"),
+        ("state.json", {"state": 5, "stage": "random"}, "`state`"),
+        ("rungs.json", {"random": {"updates": 5}}, "`random`: input should be a valid list"),
+        ("rungs.json", {"random": [{"updates": 5, "recorded": {"a": "b"}}]}, "`random.0.recorded.a`"),
+        ("stages/random.json", {"kind": "random"}, "`seconds` is missing"),
+        ("stages/finalists.json", {"kind": "f", "seconds": 1.0, "finalists": {"../x": {}}}, "a name must match"),
+        ("summary.json", {"study": "s"}, "is missing"),
+        ("environment.json", [1], "valid dictionary"),
+    ],
+)
+def test_a_file_of_the_run_that_does_not_fit_is_named_with_its_key(name, content, message, tmp_path):
+    write_json(tmp_path / name, content)
+    with pytest.raises(DataError, match=message) as refused:
+        RunFolder(tmp_path).read(name)
+    assert str(tmp_path / name) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "more than 32 tables or arrays"),
+        ("[" * 40 + "]" * 40, "more than 32 tables or arrays"),
+        ('{"a": ' + "1" * 5000 + "}", "4300 digits"),
+        ('{"a": NaN}', "NaN is no number of JSON"),
+        ('{"a": 1, "a": 2}', "'a' stands there twice"),
+    ],
+)
+def test_json_that_no_record_of_ours_is_ends_in_one_line(text, message, tmp_path):
+    (tmp_path / "state.json").write_text(text)
+    with pytest.raises(DataError, match=f"state.json: not JSON .*{message}"):
+        RunFolder(tmp_path).read("state.json")
+
+
+def test_a_record_that_is_no_text_or_no_file_is_named(tmp_path):
+    (tmp_path / "state.json").write_bytes(b'{"state": "\xff"}')
+    with pytest.raises(DataError, match=r"state\.json: not a text in UTF-8 .*byte 11"):
+        RunFolder(tmp_path).read("state.json")
+    (tmp_path / "rungs.json").mkdir()
+    with pytest.raises(DataError, match=r"rungs\.json: no regular file"):
+        RunFolder(tmp_path).read("rungs.json")
+
+
+def test_a_retraining_has_the_seed_of_its_folder(tmp_path):
+    run = RunFolder(tmp_path)
+    run.finalist("baseline", 1).start(CONFIG | {"init_seed": 1})
+    assert [record.id for record in run.retrainings()["baseline"]] == ["seed_1"]
+    run.finalist("baseline", 2).start(CONFIG | {"init_seed": 1})
+    with pytest.raises(DataError, match="seed_2/config.json: `init_seed` is not that of the folder"):
+        run.retrainings()

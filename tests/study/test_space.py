@@ -5,8 +5,8 @@ import pytest
 
 from cconv.errors import ConfigError
 from cconv.evaluation.cost_model import Estimate
-from cconv.study.closed_form import single_layers
-from cconv.study.config import TrainingConfig
+from cconv.study.closed_form import MOST_LAYERS, single_layers
+from cconv.study.config import TrainingConfig, load_study
 from cconv.study.space import (
     Choice,
     SearchSpace,
@@ -18,7 +18,8 @@ from cconv.study.space import (
 )
 from cconv.training.field_model import NetworkConfig
 
-SPACES = sorted((Path(__file__).parents[2] / "search_spaces").glob("*.toml"))
+REPOSITORY = Path(__file__).parents[2]
+SPACES = sorted((REPOSITORY / "search_spaces").glob("*.toml"))
 
 HEAD = 'name = "mini"\ndescription = "For tests."\n'
 CHOICE = '[parameters.window]\ntype = "choice"\nvalues = ["none", "poly6"]\nbaseline = "poly6"\nreason = "r"\n'
@@ -194,6 +195,18 @@ def costing(flops):
         (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
         (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
         (BASIS.replace('= "grid"', '= "radial"') + SKIP, r"the baseline is not possible .*skip 'after_activation'"),
+        (FLOAT.replace("1e-2]", "inf]"), r"`parameters\.learning_rate\.range\.1`: input should be a finite number"),
+        (FLOAT.replace("1e-4", "1e-300"), r"the value 1e-300 is not possible"),
+        (
+            INT.replace("= 4", "= true"),
+            r"`parameters\.kernel_size\.baseline`: input should be a valid integer, got True",
+        ),
+        (INT.replace("[3, 6]", "[3, 100000000000]"), r"range\.1`: input should be less than or equal to 1000000000"),
+        (CHOICE.replace('["none",', "[nan,"), r"`parameters\.window\.values\.0`: must be true, false, a number"),
+        (CHOICE.replace('"none"', ", ".join(f'"{n}"' for n in range(200))), "list should have at most 100 items"),
+        ("max_flops_per_particle = inf\n" + CHOICE, "`max_flops_per_particle`: input should be a finite number"),
+        (CHOICE.replace('"r"', '"\\u001b[2J"'), "`parameters.window.reason`: a text must hold no control characters"),
+        ("x." * 100_000 + "x = 1\n" + CHOICE, "a key has more than 32 parts"),
     ],
 )
 def test_what_does_not_fit_is_named(text, message, space_file):
@@ -201,3 +214,35 @@ def test_what_does_not_fit_is_named(text, message, space_file):
         load_space(space_file(text))
     assert "space.toml" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_true_is_no_one(space_file):
+    layers = '[parameters.layers]\ntype = "choice"\nvalues = [1, 2]\nbaseline = 1\nreason = "r"\n'
+    assert not load_space(space_file(layers)).holds({"layers": True})
+    with pytest.raises(ConfigError, match="baseline True must be one of"):
+        load_space(space_file(layers.replace("baseline = 1", "baseline = true")))
+
+
+def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
+    path = space_file(BASIS)
+    study = load_study(REPOSITORY / "experiments" / "smoke.toml", ["network.skip=after_activation"])
+    load_space(path)
+    with pytest.raises(ConfigError, match="`parameters.basis`: the value 'radial' is not possible .*after_activation"):
+        load_space(path, study)
+
+
+def test_layers_of_a_huge_space_are_drawn_without_listing_them():
+    """2e13 layers, of which no more than a limit are ever held."""
+    choices = {"relative_cutoff": [1.5 + number / 100 for number in range(100)], "radial_terms": list(range(1, 101))}
+    for name in ("window", "mapping", "interpolation", "message", "normalize"):
+        choices[name] = [f"{name}{number}" for number in range(50)]
+    parameters = {
+        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "r"}
+        for name, values in choices.items()
+    }
+    space = SearchSpace.model_validate({"name": "huge", "description": "d", "parameters": parameters})
+    network = NetworkConfig(basis="radial")
+    layers = single_layers(space, network, 3)
+    assert 1000 < len(layers) <= MOST_LAYERS
+    assert {layer["relative_cutoff"] for layer in layers} == set(choices["relative_cutoff"])
+    assert layers == single_layers(space, network, 3)

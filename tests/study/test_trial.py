@@ -41,7 +41,7 @@ def test_every_entry_is_on_disk_before_it_is_seen(generator, tmp_path):
 def test_divergence_is_a_recorded_outcome(generator, tmp_path):
     """A step this large makes the next loss infinite."""
     folder = RunFolder(tmp_path).trial("random_0000")
-    entries = list(trial(problem(generator), folder, {"learning_rate": 1e30}))
+    entries = list(trial(problem(generator), folder, {"learning_rate": 1e3, "layers": 12, "activation": "leaky_relu"}))
     assert entries[-1]["diverged"]
     assert entries[-1]["valid_normalized_mse"] is None
     assert json.loads((folder.path / "log.jsonl").read_text().splitlines()[-1])["diverged"]

@@ -2,6 +2,7 @@ import json
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from systems import problem
 
 from cconv import load_model
@@ -63,3 +64,62 @@ def test_an_unknown_setting_is_named(saved):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"colour": "red"}))
     with pytest.raises(ConfigError, match=r"config\.json: .*colour"):
         load_model(saved[2])
+
+
+def with_weights(folder, **changes):
+    """Write the weights again with other tensors; None takes one away."""
+    path = folder / "model.safetensors"
+    tensors = load_file(path) | changes
+    save_file({name: tensor for name, tensor in tensors.items() if tensor is not None}, path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"feature_mean": None}, "'feature_mean' is nothing in the weights, and .*by the settings"),
+        ({"feature_mean": torch.zeros(7)}, r"'feature_mean' is \(\(7,\), 'F32'\) in the weights"),
+        ({"feature_mean": torch.zeros(4, dtype=torch.float64)}, r"'feature_mean' is \(\(4,\), 'F64'\)"),
+        ({"colour": torch.zeros(1)}, "'colour' is .* and nothing by the settings"),
+        ({"feature_mean": torch.full((4,), torch.nan)}, "'feature_mean' holds values that are not finite"),
+        ({"feature_scale": torch.zeros(4)}, "'feature_scale' holds values that are not finite, or no scale"),
+    ],
+)
+def test_weights_that_are_not_those_of_the_settings_are_named(saved, changes, message):
+    with_weights(saved[2], **changes)
+    with pytest.raises(ConfigError, match=message):
+        load_model(saved[2])
+
+
+def test_a_huge_network_is_refused_before_anything_is_allocated(saved):
+    path = saved[2] / "config.json"
+    config = json.loads(path.read_text())
+    config["network"] |= {"first_channels": 4096, "hidden_channels": 4096, "layers": 16, "kernel_size": 32}
+    path.write_text(json.dumps(config))
+    with pytest.raises(ConfigError, match="the network would have .* learned values, more than 100,000,000"):
+        load_model(saved[2])
+    with pytest.raises(ConfigError, match="the network would have"):
+        saved[0].build_model(NetworkConfig.model_validate(config["network"]), 0)
+
+
+def test_a_huge_list_of_contents_is_refused(saved):
+    (saved[2] / "model.safetensors").write_bytes((2**40).to_bytes(8, "little") + b"{}")
+    with pytest.raises(ConfigError, match="damaged weights .its list of contents is too long"):
+        load_model(saved[2])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("config.json", "[" * 100_000, r"config\.json: not JSON .*more than 32 tables"),
+        ("config.json", "[]", r"config\.json: input should be"),
+        ("card.json", "[]", r"card\.json: input should be"),
+        ("card.json", '{"data": [1]}', r"card\.json: `data`: input should be a valid dictionary"),
+        ("card.json", '{"data_seed": 1e300}', r"card\.json: `data_seed`: input should be a valid integer"),
+        ("card.json", '{"valid_normalized_mse": NaN}', r"card\.json: not JSON .NaN is no number"),
+    ],
+)
+def test_a_damaged_description_is_named(saved, name, text, message):
+    (saved[2] / name).write_text(text)
+    read = load_model if name == "config.json" else read_card
+    with pytest.raises(ConfigError, match=message):
+        read(saved[2])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from systems import problem
 
 from cconv.errors import DataError
@@ -57,3 +58,23 @@ def test_the_progress_of_another_network_is_refused(generator, tmp_path):
     with pytest.raises(DataError, match="no progress of this training"):
         load_progress(tmp_path / "progress", given.build_model(NETWORKS[1], 0))
     assert [path.name for path in tmp_path.iterdir()] == ["progress"]
+
+
+@pytest.mark.parametrize("counts", ['{"updates": true, "seconds": 1.0}', '{"updates": 3}', "[" * 10_000, "[1]", None])
+def test_counts_that_are_none_are_refused(counts, generator, tmp_path):
+    model = problem(generator).build_model(NETWORKS[0], 0)
+    tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
+    save_file(tensors, tmp_path / "progress", counts and {"counts": counts})
+    with pytest.raises(DataError, match="no progress of this training") as refused:
+        load_progress(tmp_path / "progress", model)
+    assert "\n" not in str(refused.value)
+
+
+def test_moments_of_another_shape_are_refused(generator, tmp_path):
+    model = problem(generator).build_model(NETWORKS[0], 0)
+    name, _ = next(iter(model.named_parameters()))
+    tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
+    tensors |= {f"adam.{key}.{name}": torch.zeros(1) for key in ("step", "exp_avg", "exp_avg_sq")}
+    save_file(tensors, tmp_path / "progress", {"counts": '{"updates": 3, "seconds": 1.0}'})
+    with pytest.raises(DataError, match="moments of .* have another shape"):
+        load_progress(tmp_path / "progress", model)

@@ -1,0 +1,5 @@
+"""`python -m cconv` is `cconv`."""
+
+from cconv.cli import main
+
+main()

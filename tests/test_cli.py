@@ -1,0 +1,116 @@
+"""What the command line prints: its version, and every foreign string as it is."""
+
+import json
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+from outcomes import assert_one_clear_line
+from rich.table import Table
+from rich.text import Text
+
+from cconv.cli.console import PlainConsole, plain_column
+from cconv.cli.live import StudyDisplay, TrainingBar
+from cconv.study.records import FORMAT, RunFolder
+
+HOSTILE = "[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"
+SHOWN = r"[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"
+
+
+@pytest.fixture
+def console(tmp_path):
+    """A console on a terminal that is a file; gives it and what it has printed."""
+    with (tmp_path / "terminal").open("w") as file:
+        shown = PlainConsole(file=file, force_terminal=True, color_system=None, width=400, _environ={})
+
+        def printed():
+            file.flush()
+            return (tmp_path / "terminal").read_text()
+
+        yield shown, printed
+
+
+def test_the_version_is_printed(cconv):
+    assert cconv("--version") == (0, f"cconv {version('cconv')}\n", "")
+
+
+def test_the_package_runs_as_a_module():
+    command = [sys.executable, "-m", "cconv", "--version"]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (finished.returncode, finished.stdout) == (0, f"cconv {version('cconv')}\n")
+
+
+def test_the_commands_are_listed_with_what_they_are_for(cconv):
+    status, out, _ = cconv("--help")
+    assert status == 0
+    assert "Find the smallest, fastest continuous-convolution network" in out
+    assert all(command in out for command in ("train", "fit", "evaluate", "report", "data", "study", "--version"))
+
+
+def test_foreign_strings_are_printed_as_they_are(console):
+    shown, printed = console
+    shown.print(HOSTILE)
+    assert printed() == f"{SHOWN}\n"
+
+
+def test_foreign_strings_are_shown_as_they_are_in_tables(console):
+    shown, printed = console
+    table = Table(title=HOSTILE, caption=HOSTILE)
+    table.add_column(HOSTILE)
+    table.add_row(HOSTILE)
+    shown.print(table)
+    assert printed().count(SHOWN) == 4
+
+
+def test_a_style_is_asked_for_with_a_text(console):
+    shown, printed = console
+    shown.print(Text("bold", style="bold"), style="red")
+    assert "bold" in printed()
+
+
+def test_the_live_table_shows_foreign_strings_as_they_are(console):
+    shown, printed = console
+    with StudyDisplay(shown) as display:
+        display.on_stage(HOSTILE, 2, 10)
+        display.on_trial_start(HOSTILE, {HOSTILE: HOSTILE})
+        display.on_trial_end(HOSTILE, "failed", HOSTILE)
+        shown.print(display._draw())
+    assert printed().count(SHOWN) >= 6
+    assert "\x1b[2J" not in printed()
+
+
+def test_progress_shows_foreign_strings_as_they_are(console):
+    shown, printed = console
+    with TrainingBar(shown, "[/red]", 3):
+        pass
+    assert "[/red]" in printed()
+    assert plain_column("{task.description}").markup is False
+
+
+@pytest.mark.parametrize("name", ["[/red]", "\x1b[2J", "a\nb"])
+def test_a_run_folder_with_hostile_strings_is_shown_or_refused(name, cconv, tmp_path):
+    run = RunFolder(tmp_path)
+    run.write("study.json", {"format": FORMAT, "stages": {"random": {"kind": "random"}}})
+    run.write("state.json", {"state": "running", "stage": "random"})
+    trial = run.trial("random_0000")
+    known = {"stage": "random", "init_seed": 0, "num_parameters": 1, "flops_per_particle": 1.0}
+    trial.start(known | {"parameters": {"window": "[/red]", name: 1}})
+    trial.append({"updates": 1, "valid_normalized_mse": 0.5, "seconds": 1.0})
+    trial.finish("completed", name)
+    status, out, error = cconv("study", "status", tmp_path)
+    assert (status, error) == (0, "")
+    assert "window=[/red]" in out
+    assert "\x1b" not in out
+    run.write("state.json", {"state": "running", "stage": name})
+    assert_one_clear_line(cconv("study", "status", tmp_path), "state.json", "a name must match")
+
+
+def test_no_option_takes_a_number_that_makes_no_sense(cconv, tmp_path):
+    for ridge in ("nan", "inf", "-1", "1e300"):
+        outcome = cconv("fit", tmp_path / "study.toml", "--out", tmp_path / "out", "--ridge", ridge)
+        assert_one_clear_line(outcome, "`--ridge`")
+    for trials in ("0", "-3", "1000000000", "9" * 5000, "true"):
+        status, out, _ = cconv("study", "extend", tmp_path, "--stage", "random", "--trials", trials)
+        assert (status, out) == (2, "")
+    assert json.dumps([path.name for path in tmp_path.iterdir()]) == "[]"

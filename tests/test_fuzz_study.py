@@ -1,0 +1,350 @@
+"""Bad input of every kind that a person writes or a run folder holds: one clear line or success, never a traceback.
+
+Valid files are changed at random: a value for a hostile one, a key, bytes. Each call of the command line ends with
+status 0 or 2 within its limits of processor time and memory, and where it refuses, no run folder is left. What stays
+valid does not start a study: loading is what is tried.
+"""
+
+import contextlib
+import copy
+import io
+import json
+import resource
+import shutil
+import signal
+import sys
+import tomllib
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import tomli_w
+import typer
+from conftest import SMOKE
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from systems import problem
+from torch import Generator
+
+from cconv.cli import main
+from cconv.study.config import load_study
+from cconv.study.pipeline import begin_study
+from cconv.study.problem import provenance, with_data_path
+from cconv.study.records import RunFolder
+from cconv.study.space import load_space
+from cconv.training.checkpoint import save_model
+from cconv.training.field_model import NetworkConfig
+
+SECONDS, BYTES = 20, 2 * 2**30  # of one call
+REPOSITORY = SMOKE.parents[1]
+STUDY = SMOKE.read_text()
+SPACE = (REPOSITORY / "search_spaces" / "smoke.toml").read_text()
+ENTRY = {"updates": 6, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
+
+
+def examples(count):
+    """The same `count` examples in every run."""
+    checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
+    return settings(max_examples=count, derandomize=True, database=None, deadline=None, suppress_health_check=checks)
+
+
+def nested(depth):
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+numbers = st.sampled_from([0, 1, -1, 2**31, 2**63, 2**64, 10**400, 0.0, -0.5, 1e-300, 1e300, 1e12, True, False]) | (
+    st.floats() | st.integers()
+)
+strings = st.sampled_from(
+    [
+        "",
+        "a",
+        "../../evil",
+        "/tmp/evil",
+        "r[0-9]*",
+        "[/red]",
+        "a\nb",
+        "\x1b[2J",
+        "\x00",
+        "x" * 5000,
+        "random_0",
+        "baseline",
+    ]
+) | st.text(max_size=8)
+containers = st.sampled_from([[], {}, [[]], nested(40), nested(200), [1000, 1000], [float("nan")], {"a": {"b": 1}}])
+values = numbers | strings | containers
+
+
+def places(document, above=()):
+    """Path of every value of a nested document, tables and arrays too."""
+    inner = document.items() if isinstance(document, dict) else enumerate(document)
+    for key, value in inner:
+        yield (*above, key)
+        if isinstance(value, dict | list):
+            yield from places(value, (*above, key))
+
+
+@st.composite
+def changed(draw, document):
+    """A document with one value replaced, taken away or put under another key."""
+    document = copy.deepcopy(document)
+    *above, key = draw(st.sampled_from(list(places(document))))
+    place = document
+    for step in above:
+        place = place[step]
+    change = draw(st.sampled_from(["replace", "replace", "remove", "rename"]))
+    if change == "replace":
+        place[key] = draw(values)
+    else:
+        value = place.pop(key)
+        if change == "rename" and isinstance(place, dict):
+            place[draw(strings)] = value
+    return document
+
+
+@st.composite
+def changed_bytes(draw, content):
+    """Bytes with a piece cut out, doubled or replaced."""
+    start = draw(st.integers(0, len(content)))
+    stop = min(len(content), start + draw(st.integers(0, 200)))
+    piece = draw(st.binary(max_size=20) | st.sampled_from([content[start:stop] * 2, b"[" * 3000, b'"', b"a." * 3000]))
+    return content[:start] + piece + content[stop:]
+
+
+def changed_text(text, document, write):
+    """Three times in four a changed document, written again; else changed bytes."""
+    written = changed(document).map(lambda document: write(document).encode(errors="surrogatepass"))
+    return st.integers(0, 3).flatmap(lambda number: written if number else changed_bytes(text.encode()))
+
+
+def changed_toml(text):
+    return changed_text(text, tomllib.loads(text), tomli_w.dumps)
+
+
+def changed_json(text):
+    return changed_text(text, json.loads(text), json.dumps)
+
+
+@st.composite
+def overrides(draw):
+    """What may follow `--set`."""
+    paths = [".".join(map(str, path)) for path in places(tomllib.loads(STUDY)) if all(isinstance(k, str) for k in path)]
+    key = draw(st.sampled_from([*paths, "stages.finalists.include.x", "a." * 5000, ""]) | st.text(max_size=6))
+    value = draw(values.map(str) | st.text(max_size=8) | st.sampled_from(["[" * 5000, "1" * 5000, "0x" + "f" * 5000]))
+    return draw(st.sampled_from([f"{key}={value}", key, f"{key}=\n{value}"])).replace("\x00", "")
+
+
+@contextlib.contextmanager
+def limits():
+    """An exception for what takes too much processor time or memory."""
+    data = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmData"))
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+
+    def stop(number, frame):
+        raise TimeoutError(f"more than {SECONDS} s of processor time")
+
+    earlier = signal.signal(signal.SIGPROF, stop)
+    resource.setrlimit(resource.RLIMIT_DATA, (int(data.split()[1]) * 1024 + BYTES, before[1]))
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+        signal.signal(signal.SIGPROF, earlier)
+
+
+def check_call(*arguments):
+    """Run the command line; its status is 0, or 2 with one line."""
+    out, error = io.StringIO(), io.StringIO()
+    arguments = ["cconv", *(str(argument) for argument in arguments)]
+    with contextlib.ExitStack() as stack:
+        for context in (contextlib.redirect_stdout(out), contextlib.redirect_stderr(error), limits()):
+            stack.enter_context(context)
+        stack.enter_context(mock.patch.object(sys, "argv", arguments))
+        ended = stack.enter_context(pytest.raises(SystemExit))
+        main()
+    status = ended.value.code or 0
+    assert status in (0, 2)
+    if status == 2:
+        assert out.getvalue() == ""
+        assert error.getvalue().startswith("cconv: ")
+        assert error.getvalue().count("\n") == 1
+        assert "\x1b" not in error.getvalue()
+    return status
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory, flow_folder):
+    """Data, a run folder with two trials, and a checkpoint; all small."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    study = with_data_path(load_study(SMOKE), str(flow_folder))
+    run = RunFolder.create(folder / "run")
+    begin_study(study, load_space(study.search.space, study), run)
+    for number in range(2):
+        trial = run.trial(f"random_000{number}")
+        known = {"stage": "random", "parameters": {"kernel_size": 4}, "init_seed": 0, "num_parameters": 9}
+        trial.start(known | {"flops_per_particle": 9.0})
+        trial.append(ENTRY)
+        trial.append(ENTRY | {"updates": 18})
+        trial.finish("completed")
+    run.write("rungs.json", {"random": [{"updates": 6, "recorded": {"random_0000": 0.5}}]})
+    run.write("stages/random.json", {"kind": "random", "seconds": 1.0})
+    given_problem = problem(Generator().manual_seed(0))
+    model = given_problem.build_model(NetworkConfig(layers=1, kernel_size=3, relative_cutoff=1.5), 0)
+    save_model(model, folder / "checkpoint", provenance(study) | {"data_seed": 0})
+    return folder
+
+
+@contextlib.contextmanager
+def copied(material, name):
+    """A copy of a folder of the material, gone afterwards; nothing else may have appeared beside it."""
+    place = material / "work"
+    shutil.copytree(material / name, place / name)
+    try:
+        yield place / name
+        assert [path.name for path in place.iterdir()] == [name]
+    finally:
+        shutil.rmtree(place)
+
+
+def run_up_to_the_start(material, *arguments):
+    """`cconv study run`, which ends with success where it would begin."""
+    out = material / "out"
+    try:
+        with mock.patch("cconv.study.pipeline.begin_study", side_effect=typer.Exit(0)):
+            status = check_call("study", "run", *arguments, "--out", out)
+        assert status == 0 or not out.exists()
+    finally:
+        shutil.rmtree(out, ignore_errors=True)
+
+
+def try_study_file(material, flow_folder, content):
+    path = material / "study.toml"
+    path.write_bytes(content.replace(b"../search_spaces", str(REPOSITORY / "search_spaces").encode()))
+    run_up_to_the_start(material, path, "--data", flow_folder)
+
+
+def try_space(material, flow_folder, content):
+    path = material / "space.toml"
+    path.write_bytes(content)
+    run_up_to_the_start(material, SMOKE, "--data", flow_folder, "--set", f"search.space={path}")
+
+
+def try_override(material, flow_folder, override):
+    run_up_to_the_start(material, SMOKE, "--data", flow_folder, "--set", override)
+
+
+RECORDS = (
+    "study.json", "space.json", "state.json", "rungs.json", "stages/random.json",
+    *(f"trials/random_0000/{name}" for name in ("config.json", "outcome.json", "log.jsonl")),
+)  # fmt: skip
+COMMANDS = (("study", "status"), ("study", "extend", "--stage", "random", "--trials", "1"), ("report",))
+
+
+def changed_record(data, folder):
+    """Change a record of a folder."""
+    name = data.draw(st.sampled_from([name for name in RECORDS if (folder / name).is_file()]))
+    text = (folder / name).read_text()
+    if not name.endswith(".jsonl"):
+        return name, data.draw(changed_json(text))
+    first, *others = text.splitlines()
+    changed_line = changed_json(first).map(lambda line: b"\n".join([line, *map(str.encode, others), b""]))
+    return name, data.draw(changed_line)
+
+
+def try_record(material, data, commands=COMMANDS):
+    name, content = changed_record(data, material / "run")
+    command = data.draw(st.sampled_from(commands))
+    with copied(material, "run") as run:
+        (run / name).write_bytes(content)
+        with mock.patch("cconv.cli.study._run_stages"):
+            check_call(*command, run)
+
+
+def try_checkpoint(material, flow_folder, data):
+    name = data.draw(st.sampled_from(["config.json", "card.json", "model.safetensors"]))
+    content = (material / "checkpoint" / name).read_bytes()
+    change = changed_bytes(content) if name.endswith("tensors") else changed_json(content.decode())
+    with copied(material, "checkpoint") as checkpoint:
+        (checkpoint / name).write_bytes(data.draw(change))
+        check_call("evaluate", checkpoint, "--data", flow_folder, "--split", "valid", "--json")
+
+
+@examples(40)
+@given(content=changed_toml(STUDY))
+def test_a_changed_study_file_loads_or_is_refused_in_one_line(material, flow_folder, content):
+    try_study_file(material, flow_folder, content)
+
+
+@examples(30)
+@given(content=changed_toml(SPACE))
+def test_a_changed_space_loads_or_is_refused_in_one_line(material, flow_folder, content):
+    try_space(material, flow_folder, content)
+
+
+@examples(30)
+@given(override=overrides())
+def test_any_setting_is_taken_or_refused_in_one_line(material, flow_folder, override):
+    try_override(material, flow_folder, override)
+
+
+@examples(30)
+@given(data=st.data())
+def test_a_changed_record_is_read_or_refused_in_one_line(material, data):
+    try_record(material, data, COMMANDS[:2])
+
+
+@examples(5)
+@given(data=st.data())
+def test_a_report_of_changed_records_is_written_or_refused_in_one_line(material, data):
+    try_record(material, data, COMMANDS[2:])
+
+
+@examples(20)
+@given(data=st.data())
+def test_a_changed_checkpoint_evaluates_or_is_refused_in_one_line(material, flow_folder, data):
+    try_checkpoint(material, flow_folder, data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(300)
+@given(content=changed_toml(STUDY))
+def test_hundreds_of_study_files(material, flow_folder, content):
+    try_study_file(material, flow_folder, content)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(200)
+@given(content=changed_toml(SPACE))
+def test_hundreds_of_spaces(material, flow_folder, content):
+    try_space(material, flow_folder, content)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(200)
+@given(override=overrides())
+def test_hundreds_of_settings(material, flow_folder, override):
+    try_override(material, flow_folder, override)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(200)
+@given(data=st.data())
+def test_hundreds_of_records(material, data):
+    try_record(material, data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(100)
+@given(data=st.data())
+def test_a_hundred_checkpoints(material, flow_folder, data):
+    try_checkpoint(material, flow_folder, data)
