@@ -142,7 +142,9 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
 def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]:
     """Stability of every seed on validation trajectories; the test split is only looked at for its errors."""
     problem, scene = session.problem, session.dataset.scene
-    probes = make_probes(list(session.dataset.trajectories("valid")), scene, problem.task, _kernel(problem))
+    trajectories = list(session.dataset.trajectories("valid"))
+    reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
+    probes = make_probes(trajectories, scene, problem.task, _kernel(problem), reach)
     return {
         finalist.id: measure_stability(
             {

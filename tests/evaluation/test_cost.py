@@ -47,13 +47,11 @@ def test_wider_networks_cost_more(generator):
 def measured(models, generator, repeats=4, task="density_rate"):
     scene = periodic_scene()
     frames = [periodic_frame(generator) for _ in range(2)]
-    return measure_costs(
-        models, load_model, frames, scene, task=task, kernel=kernel(scene), threads=1, repeats=repeats
-    )
+    return measure_costs(models, load_model, frames, scene, task=task, kernel=kernel(scene), threads=1, repeats=repeats)
 
 
 def test_measured_costs_are_consistent(generator, tmp_path):
-    models = saved_models(generator, tmp_path)
+    models = {"small": saved_models(generator, tmp_path)["small"]}
     found, analytic = measured(models, generator)
     assert found.keys() == models.keys()
     for cost in [*found.values(), analytic]:
@@ -67,8 +65,13 @@ def test_measured_costs_are_consistent(generator, tmp_path):
 
 def test_models_and_the_analytic_field_take_turns_on_the_same_frames(generator, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(costs, "_time_prediction", lambda model, frame, scene: (seen.append(("model", frame)), (0, 1))[1])
-    monkeypatch.setattr(costs, "_time_analytic", lambda task, sums, frame, scene: (seen.append((task, frame)), (0, 1))[1])
+    monkeypatch.setattr(costs, "_peak_megabytes", lambda *arguments: 1.0)
+    monkeypatch.setattr(
+        costs, "_time_prediction", lambda model, frame, scene: (seen.append(("model", frame)), (0, 1))[1]
+    )
+    monkeypatch.setattr(
+        costs, "_time_analytic", lambda task, sums, frame, scene: (seen.append((task, frame)), (0, 1))[1]
+    )
     measured(saved_models(generator, tmp_path), generator, repeats=3)
     assert [name for name, _ in seen] == ["model", "model", "density_rate"] * 4
     assert all(seen[k][1] is seen[k + 1][1] is seen[k + 2][1] for k in range(0, 12, 3))
