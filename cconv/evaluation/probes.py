@@ -19,6 +19,7 @@ from cconv.sph.kernels import AbstractKernel
 REGIME_FRAMES = 20  # frames whose particles are sorted into regimes
 STRESSED_FRAMES = 3  # frames that are put into other states: the first, the middle one and the last
 ROLLOUT_FRAMES = 30  # frames of a trajectory that the rate of density is integrated over
+SMALLEST_SCALE = 0.1  # of the typical mean square, what errors are divided by where targets are smaller
 NEAR = 2.0  # particle spacings within which neighbours are counted and walls are near
 
 
@@ -46,6 +47,24 @@ class Probe:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Regime:
+    """Particles that have something in common.
+
+    Attributes:
+        members: Which of the fluid particles of all frames, one after the other, bool.
+        scale: What squared errors are divided by.
+    """
+
+    members: Tensor
+    scale: float
+
+    @property
+    def share(self) -> float:
+        """Share of the particles that belong to it."""
+        return float(self.members.double().mean())
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rollout:
     """Consecutive frames along which a rate of density is integrated.
 
@@ -69,7 +88,7 @@ class Probes:
     Attributes:
         typical: Variance of the target over the frames of the regimes.
         plain: Frames as they are.
-        regimes: Members of each regime among the fluid particles of the plain frames, one after the other.
+        regimes: Regimes among the fluid particles of the plain frames.
         stressed: Frames in other states.
         still: Frames in which the rate of density is 0; none for other tasks.
         rollout: Frames to integrate over; None for tasks that predict no rate.
@@ -77,7 +96,7 @@ class Probes:
 
     typical: float
     plain: tuple[Probe, ...]
-    regimes: dict[str, Tensor]
+    regimes: dict[str, Regime]
     stressed: tuple[Probe, ...]
     still: tuple[Probe, ...]
     rollout: Rollout | None
@@ -127,7 +146,7 @@ def make_probes(
     return Probes(
         typical=typical,
         plain=tuple(plain),
-        regimes=_regimes([probe.frame for probe in plain], scene),
+        regimes=_regimes(plain, scene, typical),
         stressed=tuple(stressed),
         still=tuple(still),
         rollout=None if task in VECTOR_TASKS else _rollout(trajectories[0], scene, task, kernel),
@@ -146,10 +165,8 @@ def _rounding(states: Sequence[FluidState], task: str, kernel: AbstractKernel) -
 
 
 def _answered(state: State, origin: str, task: str, kernel: AbstractKernel, typical: float) -> Probe:
-    """The state with its analytic field; errors are divided by its own mean square, or the typical one if larger."""
     target = TASKS[task](fluid_state(state.frame, state.scene.box, kernel), kernel)
     affected = torch.ones(len(target), dtype=torch.bool) if state.affected is None else state.affected
-    own = float(target[affected].square().mean()) if affected.any() else 0.0
     return Probe(
         name=state.name,
         origin=origin,
@@ -157,8 +174,16 @@ def _answered(state: State, origin: str, task: str, kernel: AbstractKernel, typi
         scene=state.scene,
         target=target,
         affected=affected,
-        scale=max(own, typical),
+        scale=_scale(target[affected], typical),
     )
+
+
+def _scale(targets: Tensor, typical: float) -> float:
+    """Mean square of the targets of some particles, but not less than a tenth of the typical one.
+
+    So an error of 1 is as bad as predicting 0 for them, unless their targets are so small that they hardly matter.
+    """
+    return max(float(targets.square().mean()) if len(targets) else 0.0, SMALLEST_SCALE * typical)
 
 
 def _rollout(trajectory: Trajectory, scene: Scene, task: str, kernel: AbstractKernel) -> Rollout:
@@ -172,14 +197,15 @@ def _rollout(trajectory: Trajectory, scene: Scene, task: str, kernel: AbstractKe
     )
 
 
-def _regimes(frames: Sequence[Frame], scene: Scene) -> dict[str, Tensor]:
-    """Members of each regime: near walls, at the free surface, in the bulk, at periodic faces; by number of neighbours
+def _regimes(plain: Sequence[Probe], scene: Scene, typical: float) -> dict[str, Regime]:
+    """The particles of each regime: near walls, at the free surface, in the bulk, at periodic faces; by number of neighbours
     and by speed, a quarter of the particles each; the fastest one in a hundred.
 
     Near walls: a boundary point within 2 spacings. At the surface: elsewhere, with less than three quarters of the
     median number of neighbours within 2 spacings. At a periodic face: within 2 spacings of it.
     """
-    parts = [_surroundings(frame, scene) for frame in frames]
+    parts = [_surroundings(probe.frame, scene) for probe in plain]
+    targets = torch.cat([probe.target for probe in plain])
     neighbors, near_wall, at_face, speeds = (torch.cat(values) for values in zip(*parts, strict=True))
     sparse = neighbors < 0.75 * neighbors.median()
     regimes = {
@@ -191,7 +217,11 @@ def _regimes(frames: Sequence[Frame], scene: Scene) -> dict[str, Tensor]:
         **_quarters("speed", speeds),
         "fastest_percent": speeds >= np.quantile(speeds.numpy(), 0.99),
     }
-    return {name: members for name, members in regimes.items() if members.any()}
+    return {
+        name: Regime(members=members, scale=_scale(targets[members], typical))
+        for name, members in regimes.items()
+        if members.any()
+    }
 
 
 def _surroundings(frame: Frame, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:

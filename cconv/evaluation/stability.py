@@ -60,17 +60,17 @@ class Thresholds:
     """What a stable model must hold.
 
     Attributes:
-        stressed_error: Largest error in a stressed state, mean square by that of its target over the same particles, or
-            by the target's variance over the validation frames if that is larger.
-        regime_error: Largest error in a regime, mean square by the variance of the target over the validation frames.
-        still: Largest rate of density at rest and in uniform motion, mean square by the same variance.
-        precision: Largest difference of float32 from float64, by the root of the same variance.
+        stressed_error: Largest error in a stressed state, mean square by that of the target over the same particles, or
+            by a tenth of the target's variance over the validation frames if that is larger.
+        regime_error: The same for the particles of a regime.
+        still: Largest rate of density at rest and in uniform motion, by the same measure.
+        precision: Largest difference of float32 from float64, by the root of the variance.
         density: Largest deviation of an integrated density, relative; 0.02 as Neural SPH.
     """
 
     stressed_error: float = 0.1
-    regime_error: float = 0.5
-    still: float = 0.01
+    regime_error: float = 0.1
+    still: float = 0.1
     precision: float = 1e-3
     density: float = 0.02
 
@@ -119,10 +119,12 @@ def measure_stability(seeds: Mapping[str, Predictor], probes: Probes, thresholds
     values = {check: {} for check in ("regime", "stress", "still", "precision", "density")}
     for finding in worst:
         values[finding.check][finding.label] = finding.value
-    shares = {name: float(members.double().mean()) for name, members in probes.regimes.items()}
     failures = _failures(findings, worst)
     return {
-        "regimes": {name: {"normalized_mse": value, "share": shares[name]} for name, value in values["regime"].items()},
+        "regimes": {
+            name: {"normalized_mse": value, "share": probes.regimes[name].share}
+            for name, value in values["regime"].items()
+        },
         "stress": values["stress"],
         **({"still": values["still"]} if values["still"] else {}),
         "precision": max(values["precision"].values()),
@@ -165,9 +167,9 @@ def find(predictor: Predictor, probes: Probes, thresholds: Thresholds, rollout: 
 
 
 def regime_errors(predictor: Predictor, probes: Probes) -> dict[str, float]:
-    """Mean squared error in each regime by the variance of the target."""
+    """Mean squared error in each regime by its scale."""
     errors = torch.cat([squared_errors(predictor, probe) for probe in probes.plain])
-    return {name: _finite(errors[members].mean() / probes.typical) for name, members in probes.regimes.items()}
+    return {name: _finite(errors[each.members].mean() / each.scale) for name, each in probes.regimes.items()}
 
 
 def stressed_error(predictor: Predictor, probe: Probe) -> float:

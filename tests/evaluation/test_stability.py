@@ -39,7 +39,7 @@ SCENES = [
 @lru_cache
 def system(task, dim, walls, periodic):
     """Trajectory, scene, kernel and probes of a flow."""
-    trajectory, scene = flow(dim, walls=walls, periodic=periodic)
+    trajectory, scene = flow(dim, walls=walls, periodic=periodic, frames=7 if dim == 2 else 3)
     kernel = CubicSpline(SPACING, dim)
     return trajectory, scene, kernel, make_probes([trajectory], scene, task, kernel)
 
@@ -69,9 +69,9 @@ def test_analytic_sph_passes_every_check(scene, task, dtype):
 
 
 def _places(fault):
-    """The smallest scenes in which a fault can be planted, in two and three dimensions."""
+    """Scenes in which a fault can be planted: all in 2D, in 3D those whose finding depends on the dimension."""
     walls, periodic = fault.needs_walls, fault.needs_periodic or not (fault.needs_walls or fault.needs_open)
-    return [{"dim": dim, "walls": walls, "periodic": periodic} for dim in (2, 3)]
+    return [{"dim": dim, "walls": walls, "periodic": periodic} for dim in ((2, 3) if fault.in_3d else (2,))]
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -90,7 +90,7 @@ def test_a_planted_fault_is_one_of_few_findings():
     """Faults in one situation leave the others alone, so that the name says where to look."""
     trajectory, scene, kernel, probes = system("density_rate", dim=2, walls=False, periodic=True)
     usual = usual_of(trajectory, scene, probes)
-    for name in ("zero for pairs closer than 0.2 spacings", "no number for isolated particles"):
+    for name in ("zero for pairs closer than 0.2 spacings", "explosion beyond 20 times the largest speed"):
         spoiled = Spoiled(task="density_rate", kernel=kernel, usual=usual, fault=FAULTS[name].spoil)
         (line,) = measure_stability({"it": spoiled}, probes)["failures"]
         assert FAULTS[name].named in line
@@ -105,8 +105,8 @@ def test_a_fault_of_few_particles_is_not_averaged_away():
     spoiled = Spoiled(task="density_rate", kernel=kernel, usual=usual, fault=fault)
     probe = next(probe for probe in probes.stressed if probe.name == "isolated")
     whole = replace(probe, affected=torch.ones_like(probe.affected))
-    assert stressed_error(spoiled, probe) > 0.3
-    assert stressed_error(spoiled, whole) < 0.1
+    assert stressed_error(spoiled, probe) > 2
+    assert stressed_error(spoiled, whole) < 0.5
 
 
 def test_a_model_is_stable_only_if_all_its_seeds_are():
@@ -118,8 +118,8 @@ def test_a_model_is_stable_only_if_all_its_seeds_are():
     )  # fmt: skip
     checks = measure_stability({"seed_1": good, "seed_2": bad, "seed_3": good}, probes)
     assert not checks["stable"]
-    (line,) = checks["failures"]
-    assert "seeds seed_2 of 3" in line
+    assert all("seeds seed_2 of 3" in line for line in checks["failures"])
+    assert any("isolated" in line for line in checks["failures"])
     assert checks["stress"]["isolated"] == NOT_FINITE
     assert checks["counts"]["seeds"] == 3
 
@@ -181,7 +181,7 @@ def test_each_threshold_decides_about_its_own_check(model):
 def test_regimes_share_out_all_particles_and_their_errors(model):
     probes = probes_of_model()
     errors = regime_errors(ModelPredictor(model), probes)
-    shares = {name: float(members.double().mean()) for name, members in probes.regimes.items()}
+    shares = {name: regime.share for name, regime in probes.regimes.items()}
     whole = torch.cat([(model.predict_frame(each.frame, each.scene.box) - each.target)[:, 0] for each in probes.plain])
     for names in (
         ["near_wall", "free_surface", "bulk"],
@@ -190,8 +190,8 @@ def test_regimes_share_out_all_particles_and_their_errors(model):
     ):
         present = [name for name in names if name in shares]
         assert sum(shares[name] for name in present) == pytest.approx(1.0)
-        mean = sum(shares[name] * errors[name] for name in present)
-        assert mean == pytest.approx(float(whole.square().mean() / probes.typical), rel=1e-5)
+        mean = sum(shares[name] * errors[name] * probes.regimes[name].scale for name in present)
+        assert mean == pytest.approx(float(whole.square().mean()), rel=1e-5)
 
 
 def test_the_integral_of_the_analytic_rate_does_not_drift():
