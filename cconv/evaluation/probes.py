@@ -198,8 +198,8 @@ def _rollout(trajectory: Trajectory, scene: Scene, task: str, kernel: AbstractKe
 
 
 def _regimes(plain: Sequence[Probe], scene: Scene, typical: float) -> dict[str, Regime]:
-    """The particles of each regime: near walls, at the free surface, in the bulk, at periodic faces; by number of neighbours
-    and by speed, a quarter of the particles each; the fastest one in a hundred.
+    """The particles of each regime: near walls, at the free surface, in the bulk, at periodic faces; by number of
+    neighbours and by speed, a quarter of the particles each; the fastest one in a hundred.
 
     Near walls: a boundary point within 2 spacings. At the surface: elsewhere, with less than three quarters of the
     median number of neighbours within 2 spacings. At a periodic face: within 2 spacings of it.

@@ -225,7 +225,7 @@ FAULTS = {
     "wrong when tilted": Fault(flips_when_tilted, "tilted", needs_walls=True),
     "wrong when mirrored": Fault(flips_when_mirrored, "mirrored"),
     "wrong at half density": Fault(flips_at_half_density, "half_density", in_3d=True),
-    "wrong for stretched lattices": Fault(wrong_for_stretched_lattices, "stretched", in_3d=True),
+    "wrong for stretched lattices": Fault(wrong_for_stretched_lattices, "stretched"),
     "dependence on the place": Fault(depends_on_the_place, "far_away"),
     "dependence on the frame of reference": Fault(depends_on_the_frame_of_reference, "moving_frame"),
     "rate of a translation": Fault(rate_of_a_translation, "uniform_velocity", RATE),

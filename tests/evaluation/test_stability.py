@@ -98,15 +98,35 @@ def test_a_planted_fault_is_one_of_few_findings():
 
 
 def test_a_fault_of_few_particles_is_not_averaged_away():
-    """A frame of thousands with one isolated particle that is off by the typical rate: only that particle counts."""
-    trajectory, scene, kernel, probes = system("density_rate", dim=2, walls=False, periodic=True)
-    usual = usual_of(trajectory, scene, probes)
-    fault = FAULTS["a constant for isolated particles"].spoil
-    spoiled = Spoiled(task="density_rate", kernel=kernel, usual=usual, fault=fault)
-    probe = next(probe for probe in probes.stressed if probe.name == "isolated")
-    whole = replace(probe, affected=torch.ones_like(probe.affected))
-    assert stressed_error(spoiled, probe) > 2
-    assert stressed_error(spoiled, whole) < 0.5
+    """One particle in a thousand is off by the typical rate; where it is the one that counts, nothing else does."""
+    *_, probes = system("density_rate", dim=2, walls=False, periodic=True)
+    wrong = torch.zeros(1000, 1)
+    wrong[7] = 1.0
+    probe = replace(
+        probes.stressed[0], target=torch.zeros(1000, 1).double(), affected=wrong[:, 0] > 0, scale=1.0
+    )  # fmt: skip
+
+    class Constant(Analytic):
+        def predict(self, frame, scene):
+            return wrong
+
+    constant = Constant(task="density_rate", kernel=None)
+    assert stressed_error(constant, probe) == 1.0
+    everywhere = replace(probe, affected=torch.ones(1000, dtype=torch.bool))
+    assert stressed_error(constant, everywhere) == pytest.approx(1e-3)
+
+
+def test_particles_that_were_changed_are_those_that_count():
+    *_, probes = system("density_rate", dim=2, walls=False, periodic=True)
+    counted = {probe.name: float(probe.affected.double().mean()) for probe in probes.stressed}
+    plain = probes.plain[0].frame.positions
+    clumped = next(probe for probe in probes.stressed if probe.name == "clumped")
+    moved = (clumped.frame.positions != plain).any(dim=1)
+    assert 4 <= moved.sum() <= 8
+    assert bool(clumped.affected[moved].all())
+    assert int(clumped.affected.sum()) == 2 * int(moved.sum())
+    assert counted["as_it_is"] == counted["turned"] == 1
+    assert 0 < counted["squeezed"] < 1
 
 
 def test_a_model_is_stable_only_if_all_its_seeds_are():
