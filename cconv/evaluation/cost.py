@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import random
 import resource
 import statistics
 import time
@@ -104,7 +105,8 @@ def measure_costs(
 ) -> tuple[dict[str, Cost], AnalyticCost]:
     """Cost of each model and of the analytic field on the same frames.
 
-    They take turns, so that a change of the machine's speed meets all of them alike; one round is a warm-up.
+    They take turns, so that a change of the machine's speed meets all of them alike, each turn in an order of its own;
+    one round is a warm-up.
 
     Args:
         models: Checkpoint folder of each model.
@@ -312,11 +314,15 @@ def surroundings_of(inputs: Inputs, relative_cutoff: float, particle_spacing: fl
 
 
 def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tuple[float, float]]]:
-    """Times of geometry and network of each call, s; the first of its turns is left out."""
+    """Times of geometry and network of each call, s; the first of its turns is left out.
+
+    Each turn has an order of its own, as a call leaves the caches to the next one.
+    """
     times = {name: [] for name in calls}
+    orders = random.Random(0)
     for turn in range(repeats + 1):
-        for name, call in calls.items():
-            times[name].append(call(turn))
+        for name in orders.sample(list(calls), len(calls)):
+            times[name].append(calls[name](turn))
     return {name: samples[1:] for name, samples in times.items()}
 
 

@@ -73,7 +73,9 @@ def test_models_and_the_analytic_field_take_turns_on_the_same_frames(generator, 
         costs, "_time_analytic", lambda task, sums, frame, scene: (seen.append((task, frame)), (0, 1))[1]
     )
     measured(saved_models(generator, tmp_path), generator, repeats=3)
-    assert [name for name, _ in seen] == ["model", "model", "density_rate"] * 4
+    turns = [tuple(name for name, _ in seen[k : k + 3]) for k in range(0, 12, 3)]
+    assert all(sorted(turn) == ["density_rate", "model", "model"] for turn in turns)
+    assert len(set(turns)) > 1  # who comes first changes
     assert all(seen[k][1] is seen[k + 1][1] is seen[k + 2][1] for k in range(0, 12, 3))
     assert seen[0][1] is seen[6][1]
     assert seen[0][1] is not seen[3][1]
