@@ -114,7 +114,7 @@ def measure_stability(seeds: Mapping[str, Predictor], probes: Probes, thresholds
     """
     thresholds = thresholds or Thresholds()
     rollouts = {name: density_rollout(seed, probes, thresholds.density) for name, seed in seeds.items()}
-    findings = {name: find(seed, probes, thresholds, rollouts[name]) for name, seed in seeds.items()}
+    findings = {name: findings_of(seed, probes, thresholds, rollouts[name]) for name, seed in seeds.items()}
     worst = _worst(findings)
     values = {check: {} for check in ("regime", "stress", "still", "precision", "density")}
     for finding in worst:
@@ -140,7 +140,7 @@ def measure_stability(seeds: Mapping[str, Predictor], probes: Probes, thresholds
     }
 
 
-def find(predictor: Predictor, probes: Probes, thresholds: Thresholds, rollout: Mapping | None) -> list[Finding]:
+def findings_of(predictor: Predictor, probes: Probes, thresholds: Thresholds, rollout: Mapping | None) -> list[Finding]:
     """What every check finds in one predictor, given its rollout."""
     findings = [
         *(
