@@ -29,7 +29,7 @@ from cconv.sph.kernels import AbstractKernel, kernel_named
 from cconv.training.field_model import FieldConfig, FieldModel
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
-RESOLUTION = 0.02  # relative difference of two times that one model, timed twice in one run, shows against itself
+RESOLUTION = 0.02  # relative difference of two times that is too small to choose a model by
 
 # Times of the geometry and of the rest of one prediction, s, given the number of the turn.
 Call = Callable[[int], tuple[float, float]]
@@ -144,7 +144,7 @@ def times_tie(ours: Sequence[float], other: Sequence[float]) -> bool:
 
     A sign test on paired turns: the 95 % interval of the median ratio of the two times in a turn, from order statistics
     by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must reach 1, or come
-    as close as two timings of one model do (`RESOLUTION`). Fewer than six turns tell nothing apart.
+    closer to it than is worth a choice (`RESOLUTION`). Fewer than six turns tell nothing apart.
 
     Args:
         ours: Time of each turn, such as `Cost.turns_ms`.

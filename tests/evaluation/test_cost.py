@@ -98,7 +98,7 @@ def test_times_within_their_noise_tie():
     load = np.exp(rng.normal(0, 0.5, 20))  # other work on the machine, which slows both of a turn alike
     noise = np.exp(rng.normal(0, 0.05, (2, 20)))
     assert times_tie(load * noise[0], load * noise[1])
-    assert times_tie(1.01 * load, load)  # within what one model differs from itself
+    assert times_tie(1.01 * load, load)  # too little to choose by
     assert not times_tie(1.2 * load * noise[0], load * noise[1])
     assert not times_tie(load * noise[1], 1.2 * load * noise[0])
 
