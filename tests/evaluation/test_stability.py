@@ -222,7 +222,7 @@ def test_the_integral_of_the_analytic_rate_does_not_drift():
 
 
 def test_frames_that_lie_apart_spoil_the_integral_of_the_rate_but_not_the_check():
-    """The same flow in steps of one frame and of six: a bias drifts alike, though the rate alone is far off."""
+    """The same flow in steps of one frame and of six: a bias drifts alike, though the rate alone is far off the density."""
     *_, kernel, probes = system("density_rate", dim=2, walls=False, periodic=True)
     coarse = replace(
         probes.rollout, frames=probes.rollout.frames[::6], targets=probes.rollout.targets[::6],
@@ -233,8 +233,8 @@ def test_frames_that_lie_apart_spoil_the_integral_of_the_rate_but_not_the_check(
     spoiled = Spoiled(task="density_rate", kernel=kernel, usual=usual, fault=FAULTS["a bias that drifts"].spoil)
     fine, apart = (density_rollout(spoiled, replace(probes, rollout=each)) for each in (probes.rollout, coarse))
     assert apart["drift"] == pytest.approx(fine["drift"], rel=1e-3)
-    assert apart["analytic_by_frames"] > 2 * fine["analytic_by_frames"]
-    assert apart["analytic_by_frames"] > 0.02
+    assert apart["largest"] == pytest.approx(fine["largest"], rel=1e-3)
+    assert apart["analytic_by_frames"] > 0.05  # by which the rate alone, summed over frames, misses the density
 
 
 def test_predictions_that_are_not_finite_fail_every_check():
@@ -248,7 +248,7 @@ def test_predictions_that_are_not_finite_fail_every_check():
     assert checks["regimes"]["bulk"]["normalized_mse"] == NOT_FINITE
     assert set(checks["stress"].values()) == set(checks["still"].values()) == {NOT_FINITE}
     assert checks["precision"] == checks["density_rollout"]["largest"] == NOT_FINITE
-    assert checks["density_rollout"]["first_frame_outside"] == 0
+    assert checks["density_rollout"]["first_frame_outside"] == 1
     json.dumps(checks, allow_nan=False)
 
 
