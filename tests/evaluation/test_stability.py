@@ -222,7 +222,7 @@ def test_the_integral_of_the_analytic_rate_does_not_drift():
 
 
 def test_frames_that_lie_apart_spoil_the_integral_of_the_rate_but_not_the_check():
-    """The same flow in steps of one frame and of six: a bias drifts alike, though the rate alone is far off the density."""
+    """The same flow in steps of one frame and of six: a bias drifts alike, though the rate alone is far off."""
     *_, kernel, probes = system("density_rate", dim=2, walls=False, periodic=True)
     coarse = replace(
         probes.rollout, frames=probes.rollout.frames[::6], targets=probes.rollout.targets[::6],
