@@ -10,7 +10,8 @@ def whole_summary(summary: dict) -> dict:
     whole = copy.deepcopy(summary)
     ids = [entry["id"] for entry in whole["finalists"]]
     whole["search_points"] = _search_points()
-    whole["analytic"] = {"ms_per_frame": 2.2, "ms_low": 2.1, "ms_high": 2.35}
+    whole["analytic"] = {"ms_per_frame": 2.2, "ms_low": 2.1, "ms_high": 2.35, "geometry_ms": 1.5, "network_ms": 0.7}
+    whole["analytic"]["turns_ms"] = [2.1, 2.2, 2.35]
     whole["front"] = {
         "attainment": [
             {"ms_per_frame": 1.5, "median": None, "low": None, "high": None},
@@ -73,12 +74,15 @@ def stability(error: float) -> dict:
             "bulk": {"normalized_mse": error, "share": 0.9},
             "near_wall": {"normalized_mse": error, "share": 0.1},
         },
-        "stress": {"clumped": error, "isolated": None},
+        "stress": {"clumped": error, "isolated": 0.5 * error},
+        "still": {"rest": 0.0, "uniform_velocity": 1e-9},
         "precision": 1e-6,
-        "density_rollout": {"frames": 60, "drift": 1e-3, "largest": 1e-3, "first_frame_outside": None},
+        "density_rollout": {"frames": 60, "drift": 1e-3, "largest": 1e-3, "first_frame_outside": None}
+        | {"analytic_by_frames": 0.12},
         "stable": not failures,
         "failures": failures,
-        "thresholds": {"stressed_error": 0.05, "regime_error": 0.5, "precision": 1e-3, "density": 0.02},
+        "thresholds": {"stressed_error": 0.05, "regime_error": 0.5, "still": 0.01, "precision": 1e-3, "density": 0.02},
+        "counts": {"seeds": 3, "plain_frames": 20, "stressed_frames": 3},
     }
 
 

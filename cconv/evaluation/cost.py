@@ -2,38 +2,53 @@
 
 import itertools
 import math
+import random
 import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
+from scipy.stats import binom
 
-from cconv.data.features import FluidState, Inputs
+from cconv.data.features import Inputs, inputs_without_density
 from cconv.data.targets import VECTOR_TASKS
+from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
+from cconv.errors import ConfigError
 from cconv.evaluation.cost_model import Surroundings, estimate
 from cconv.neighbors import radius_graph
+from cconv.sph.compiled import CompiledSums
+from cconv.sph.kernels import AbstractKernel, kernel_named
 from cconv.training.field_model import FieldConfig, FieldModel
+
+ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
+RESOLUTION = 0.02  # relative difference of two times that is too small to choose a model by
+
+# Times of the geometry and of the rest of one prediction, s, given the number of the turn.
+Call = Callable[[int], tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Cost of predicting one frame, neighbour search included.
+    """Cost of predicting one frame as a user does, by `predict_frame`.
 
-    The density among the input features is taken as given: a solver has it, and all models share it.
+    The time is that of everything from the particles of a stored frame to the field in the units of the data: features,
+    the sum of densities for models that take it, neighbour search, geometry and network.
 
     Attributes:
         ms_per_frame: Median time of a frame, ms.
         ms_low: Lower quartile.
         ms_high: Upper quartile.
-        geometry_ms: Median time of neighbour search and geometry.
+        geometry_ms: Median time of all but the network: features, densities, neighbours, geometry.
         network_ms: Median time of the network alone.
+        turns_ms: Time of each turn, ms; the same turn of all models that were timed together had the same frame.
         us_per_particle: Median time over the number of fluid particles, µs.
         peak_mb: Memory that predictions add to a fresh process at most, MB.
         flops_per_particle: Multiplications and additions of one particle's prediction.
@@ -46,6 +61,7 @@ class Cost:
     ms_high: float
     geometry_ms: float
     network_ms: float
+    turns_ms: tuple[float, ...]
     us_per_particle: float
     peak_mb: float
     flops_per_particle: float
@@ -53,69 +69,101 @@ class Cost:
     num_particles: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class AnalyticCost:
+    """Cost of the analytic field of one frame: neighbour search, and compiled sums over the pairs.
+
+    The density gradient sums the densities first, as a user has to.
+
+    Attributes:
+        ms_per_frame: Median time of a frame, ms.
+        ms_low: Lower quartile.
+        ms_high: Upper quartile.
+        geometry_ms: Median time of the neighbour search.
+        network_ms: Median time of the sums.
+        turns_ms: Time of each turn, ms, as in `Cost`.
+    """
+
+    ms_per_frame: float
+    ms_low: float
+    ms_high: float
+    geometry_ms: float
+    network_ms: float
+    turns_ms: tuple[float, ...]
+
+
 def measure_costs(
     models: Mapping[str, Path],
     load: Callable[[Path], FieldModel],
-    inputs: Sequence[Inputs],
+    frames: Sequence[Frame],
+    scene: Scene,
     *,
+    task: str,
+    kernel: AbstractKernel,
     threads: int,
     repeats: int,
-) -> dict[str, Cost]:
-    """Cost of each model on the same frames.
+) -> tuple[dict[str, Cost], AnalyticCost]:
+    """Cost of each model and of the analytic field on the same frames.
 
-    The models take turns, so that a change of the machine's speed meets all of them alike; one round is a warm-up.
+    They take turns, so that a change of the machine's speed meets all of them alike, each turn in an order of its own;
+    one round is a warm-up.
 
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
-        inputs: Frames to predict, in turn.
+        frames: Frames to predict, in turn.
+        scene: Their scene.
+        task: Which analytic field: "density_rate" or "density_gradient".
+        kernel: SPH kernel of the analytic field.
         threads: Torch threads.
-        repeats: Timed predictions of each model.
+        repeats: Timed predictions of each model, at least 2.
     """
     loaded = {name: load(path) for name, path in models.items()}
+    calls = {name: _model_call(model, frames, scene) for name, model in loaded.items()}
+    calls[ANALYTIC] = _analytic_call(task, kernel, frames, scene)
     with _threads(threads):
-        times = _times_in_turn({name: (model, inputs) for name, model in loaded.items()}, repeats)
-    particles = statistics.fmean(frame.num_particles for frame in inputs)
+        times = _times_in_turn(calls, repeats)
+    particles = statistics.fmean(_num_fluid(frame) for frame in frames)
     costs = {}
     for name, model in loaded.items():
         medians = _medians(times[name])
         costs[name] = Cost(
             **medians,
+            turns_ms=_turns(times[name]),
             us_per_particle=1e3 * medians["ms_per_frame"] / max(particles, 1),
-            peak_mb=_peak_megabytes(load, models[name], inputs[0], threads),
-            flops_per_particle=flops_per_particle(model, inputs[0]),
+            peak_mb=_peak_megabytes(load, models[name], frames[0], scene, threads),
+            flops_per_particle=flops_per_particle(model, inputs_without_density(frames[0], scene.box)),
             threads=threads,
             num_particles=particles,
         )
-    return costs
+    return costs, AnalyticCost(**_medians(times[ANALYTIC]), turns_ms=_turns(times[ANALYTIC]))
 
 
-def measure_analytic(
-    states: Sequence[FluidState], box: Box, field: Callable, kernel, *, threads: int, repeats: int
-) -> dict[str, float]:
-    """Time of the analytic field itself, neighbour search within the kernel's support included, densities given.
+def times_tie(ours: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether the times of two models, measured in turn, do not differ beyond their noise.
+
+    A sign test on paired turns: the 95 % interval of the median ratio of the two times in a turn, from order statistics
+    by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must reach 1, or come
+    closer to it than is worth a choice (`RESOLUTION`). Fewer than six turns tell nothing apart.
 
     Args:
-        states: Fluid of the frames to compute it on, in turn, in the precision of the networks.
-        box: Their box.
-        field: State and kernel to the field (N, C).
-        kernel: SPH kernel.
-        threads: Torch threads.
-        repeats: Timed frames.
+        ours: Time of each turn, such as `Cost.turns_ms`.
+        other: Times of the other model in the same turns.
 
-    Returns:
-        "ms_per_frame", "ms_low", "ms_high", "geometry_ms" (neighbours) and "network_ms" (the field).
+    Raises:
+        ConfigError: If the turns are not as many.
     """
-    times = []
-    with _threads(threads):
-        for repeat in range(repeats + 1):
-            state = states[repeat % len(states)]
-            start = time.perf_counter()
-            state = replace(state, edges=radius_graph(state.positions, kernel.support_radius, box))
-            middle = time.perf_counter()
-            field(state, kernel)
-            times.append((middle - start, time.perf_counter() - middle))
-    return _medians(times[1:])
+    if len(ours) != len(other):
+        raise ConfigError(
+            f"`ours` and `other` must be times of the same turns, got {len(ours)} and {len(other)}; "
+            "measure both in one run."
+        )
+    ratios = sorted(first / second for first, second in zip(ours, other, strict=True))
+    below = int(binom.ppf(0.025, len(ratios), 0.5))  # the largest number with P(fewer) <= 0.025
+    if below == 0:
+        return True
+    low, high = ratios[below - 1], ratios[-below]
+    return low <= 1 + RESOLUTION and high >= 1 / (1 + RESOLUTION)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +175,7 @@ class FrameTime:
         ms_per_frame: Median time, ms.
         ms_low: Lower quartile.
         ms_high: Upper quartile.
-        geometry_ms: Median time of neighbour search and geometry.
+        geometry_ms: Median time of all but the network.
         network_ms: Median time of the network alone.
     """
 
@@ -158,6 +206,7 @@ def measure_growth(
     models: Mapping[str, Path],
     load: Callable[[Path], FieldModel],
     *,
+    analytic: FieldConfig | None = None,
     sizes: Sequence[int] = (1000, 3000, 10_000, 30_000, 100_000),
     threads: int,
     repeats: int,
@@ -171,32 +220,32 @@ def measure_growth(
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
+        analytic: Field that is also summed analytically, in turn with the models, under the name `ANALYTIC`.
         sizes: Numbers of fluid particles, ascending.
         threads: Torch threads.
         repeats: Timed predictions of each model and size, at least 2.
         max_seconds: Longest median time of a frame after which a model goes on.
     """
-    loaded = {name: load(path) for name, path in models.items()}
-    measured: dict[str, list[FrameTime]] = {name: [] for name in loaded}
+    callers = {name: partial(_block_call, load(path)) for name, path in models.items()}
+    if analytic is not None:
+        callers[ANALYTIC] = partial(_analytic_block_call, analytic)
+    measured: dict[str, list[FrameTime]] = {name: [] for name in callers}
     with _threads(threads):
         for size in sizes:
-            times = _times_in_turn(
-                {
-                    name: (model, [fluid_block(size, model.config)])
-                    for name, model in loaded.items()
-                    if not measured[name] or measured[name][-1].ms_per_frame <= 1e3 * max_seconds
-                },
-                repeats,
-            )
-            for name, samples in times.items():
-                measured[name].append(FrameTime(num_particles=size, **_medians(samples)))
+            going_on = {
+                name: call_of(size)
+                for name, call_of in callers.items()
+                if not measured[name] or measured[name][-1].ms_per_frame <= 1e3 * max_seconds
+            }
+            for name, times in _times_in_turn(going_on, repeats).items():
+                measured[name].append(FrameTime(num_particles=size, **_medians(times)))
     return {
         name: Growth(times=tuple(times), exponent=_exponent(times), left_out=tuple(sizes[len(times) :]))
         for name, times in measured.items()
     }
 
 
-def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> Inputs:
+def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> tuple[Frame, Scene]:
     """A cube of fluid in open space for a model: a jittered lattice with random velocities, on a layer of wall points.
 
     Args:
@@ -210,19 +259,34 @@ def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> Inputs
     ticks = torch.arange(side) + 0.5
     lattice = torch.cartesian_prod(*[ticks] * dim).reshape(-1, dim)
     jitter = 0.2 * (torch.rand(num_particles, dim, generator=generator) - 0.5)
-    ones = torch.ones(num_particles, 1)
-    velocities = torch.randn(num_particles, dim, generator=generator)
-    walls, normals = None, None
+    boundary = None
     if field.boundary_channels:  # below the first axis, along which the cube fills up
         walls = lattice[: side ** (dim - 1)] - torch.eye(dim)[0]
-        normals = torch.eye(dim)[:1] if field.boundary_channels == dim else torch.ones(1, field.boundary_channels)
-        normals = normals.repeat(len(walls), 1)
-    return Inputs(
+        normals = torch.eye(dim)[:1].expand_as(walls).clone() if field.boundary_channels == dim else None
+        boundary = Boundary(positions=spacing * walls, normals=normals)
+    frame = Frame(
         positions=spacing * (lattice[:num_particles] + jitter),
-        features=torch.cat([ones, velocities, ones], dim=1),
-        boundary_positions=None if walls is None else spacing * walls,
-        boundary_features=normals,
+        velocities=torch.randn(num_particles, dim, generator=generator),
+        masses=torch.full((num_particles,), spacing**dim),
+        particle_types=torch.full((num_particles,), int(ParticleType.FLUID)),
+        boundary=boundary,
+    )
+    return frame, _block_scene(field, side)
+
+
+def _block_scene(field: FieldConfig, side: int) -> Scene:
+    dim, spacing = field.dim, field.particle_spacing
+    return Scene(
+        name="block",
+        dim=dim,
+        particle_spacing=spacing,
+        frame_dt=1.0,
         box=Box([0] * dim, [spacing * side] * dim),
+        force=None,
+        has_boundary=bool(field.boundary_channels),
+        velocity_source="stored",
+        mass_source="stored",
+        missing=(),
     )
 
 
@@ -249,29 +313,80 @@ def surroundings_of(inputs: Inputs, relative_cutoff: float, particle_spacing: fl
     return Surroundings.counted(relative_cutoff, inputs.positions.shape[1], *counts)
 
 
-def _times_in_turn(
-    models: Mapping[str, tuple[FieldModel, Sequence[Inputs]]], repeats: int
-) -> dict[str, list[tuple[float, float]]]:
-    """Times of geometry and network of each model on its frames, s; the first of its turns is left out."""
-    times = {name: [] for name in models}
-    for repeat in range(repeats + 1):
-        for name, (model, frames) in models.items():
-            times[name].append(_time_prediction(model, frames[repeat % len(frames)]))
+def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tuple[float, float]]]:
+    """Times of geometry and network of each call, s; the first of its turns is left out.
+
+    Each turn has an order of its own, as a call leaves the caches to the next one.
+    """
+    times = {name: [] for name in calls}
+    orders = random.Random(0)
+    for turn in range(repeats + 1):
+        for name in orders.sample(list(calls), len(calls)):
+            times[name].append(calls[name](turn))
     return {name: samples[1:] for name, samples in times.items()}
 
 
-@torch.no_grad()
-def _time_prediction(model: FieldModel, inputs: Inputs) -> tuple[float, float]:
+def _model_call(model: FieldModel, frames: Sequence[Frame], scene: Scene) -> Call:
+    return lambda turn: _time_prediction(model, frames[turn % len(frames)], scene)
+
+
+def _analytic_call(task: str, kernel: AbstractKernel, frames: Sequence[Frame], scene: Scene) -> Call:
+    sums = CompiledSums(kernel)
+    return lambda turn: _time_analytic(task, sums, frames[turn % len(frames)], scene)
+
+
+def _block_call(model: FieldModel, size: int) -> Call:
+    frame, scene = fluid_block(size, model.config)
+    return _model_call(model, [frame], scene)
+
+
+def _analytic_block_call(field: FieldConfig, size: int) -> Call:
+    frame, scene = fluid_block(size, field)
+    kernel = kernel_named(field.kernel)(field.smoothing_length, field.dim)
+    return _analytic_call(field.task, kernel, [frame], scene)
+
+
+def _time_prediction(model: FieldModel, frame: Frame, scene: Scene) -> tuple[float, float]:
+    """Time of `predict_frame` outside of the network and within it."""
+    marks = []
+    hooks = [
+        model.network.register_forward_pre_hook(lambda *_: marks.append(time.perf_counter())),
+        model.network.register_forward_hook(lambda *_: marks.append(time.perf_counter())),
+    ]
     start = time.perf_counter()
-    geometry = model.geometry(inputs)
+    model.predict_frame(frame, scene.box)
+    total = time.perf_counter() - start
+    for hook in hooks:
+        hook.remove()
+    network = marks[1] - marks[0]
+    return total - network, network
+
+
+def _time_analytic(task: str, sums: CompiledSums, frame: Frame, scene: Scene) -> tuple[float, float]:
+    """Time of the neighbour search, fluid picked out of the frame, and of the sums."""
+    start = time.perf_counter()
+    fluid = frame.particle_types == ParticleType.FLUID
+    masses, positions, velocities = (values[fluid] for values in (frame.masses, frame.positions, frame.velocities))
+    edges = radius_graph(positions, sums.kernel.support_radius, scene.box)
     middle = time.perf_counter()
-    model(inputs, geometry)
+    if task in VECTOR_TASKS:
+        sums.density_gradient(masses, sums.density(masses, edges), edges)
+    else:
+        sums.density_rate(masses, velocities, edges)
     return middle - start, time.perf_counter() - middle
+
+
+def _num_fluid(frame: Frame) -> int:
+    return int((frame.particle_types == ParticleType.FLUID).sum())
+
+
+def _turns(times: Sequence[tuple[float, float]]) -> tuple[float, ...]:
+    return tuple(1e3 * (geometry + network) for geometry, network in times)
 
 
 def _medians(times: Sequence[tuple[float, float]]) -> dict[str, float]:
     """Times of frames with their quartiles, ms, by their names in `Cost` and `FrameTime`."""
-    low, median, high = statistics.quantiles((1e3 * (geometry + network) for geometry, network in times), n=4)
+    low, median, high = statistics.quantiles(_turns(times), n=4, method="inclusive")
     return {
         "ms_per_frame": median,
         "ms_low": low,
@@ -288,18 +403,20 @@ def _exponent(times: Sequence[FrameTime]) -> float:
     return statistics.linear_regression([math.log(n) for n in sizes], [math.log(ms) for ms in medians]).slope
 
 
-def _peak_megabytes(load: Callable[[Path], FieldModel], path: Path, inputs: Inputs, threads: int) -> float:
+def _peak_megabytes(load: Callable[[Path], FieldModel], path: Path, frame: Frame, scene: Scene, threads: int) -> float:
     """Growth of the peak memory of a fresh process by two predictions."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_memory_of_predictions, load, path, inputs, threads).result()
+        return pool.submit(_memory_of_predictions, load, path, frame, scene, threads).result()
 
 
-def _memory_of_predictions(load: Callable[[Path], FieldModel], path: Path, inputs: Inputs, threads: int) -> float:
+def _memory_of_predictions(
+    load: Callable[[Path], FieldModel], path: Path, frame: Frame, scene: Scene, threads: int
+) -> float:
     torch.set_num_threads(threads)
     model = load(path)
     before = _peak_resident_megabytes()
     for _ in range(2):
-        model.predict(inputs)
+        model.predict_frame(frame, scene.box)
     return _peak_resident_megabytes() - before
 
 

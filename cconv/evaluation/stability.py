@@ -1,28 +1,58 @@
-"""Where methods fail: errors by regime, on stressed frames, by precision, and of a density integrated over frames.
+"""Where methods fail: errors by regime, in stressed states, at rest, by precision, and of a density over time.
 
 A model that is accurate on average may fail at the free surface, where particles clump (tensile instability), or where
-a scene is denser or faster than the training data. Each check has a threshold; a model that passes all is stable.
+a scene is denser or faster than the training data. Each check gives findings with a limit; a model all of whose seeds
+keep every limit is stable.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from cconv.data.features import fluid_state
-from cconv.data.targets import make_sample
-from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene, Trajectory
-from cconv.domain import Box
-from cconv.evaluation.metrics import frame_errors
-from cconv.neighbors import radius_graph
+from cconv.data.features import fluid_state, make_inputs
+from cconv.data.trajectory import Frame, Scene
+from cconv.evaluation.probes import Probe, Probes, Rollout
 from cconv.training.field_model import FieldModel
 
 NOT_FINITE = 1e9  # stands for an error that is infinite or no number, so that files can hold it
-NEAR = 2.0  # particle spacings within which neighbours are counted and walls are near
+PRECISE_STATES = ("as_it_is", "far_away")  # states in which float32 is compared with float64
+USUAL = 0.95  # share of the particles whose density must keep the limit
+
+
+class Predictor(Protocol):
+    """What is checked: a trained model, or anything else that predicts the field of a frame."""
+
+    def predict(self, frame: Frame, scene: Scene) -> Tensor:
+        """Field (N, C) at the fluid particles, as it is used."""
+
+    def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
+        """The same in float64."""
+
+
+class ModelPredictor:
+    """A trained model as a `Predictor`.
+
+    Args:
+        model: The model.
+    """
+
+    def __init__(self, model: FieldModel):
+        self._model, self._exact = model, deepcopy(model).double()
+
+    def predict(self, frame: Frame, scene: Scene) -> Tensor:
+        """Field (N, C) in the units of the data, as `FieldModel.predict_frame`."""
+        return self._model.predict_frame(frame, scene.box)
+
+    def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
+        """The same with weights and inputs in float64."""
+        inputs = make_inputs(fluid_state(frame, scene.box, self._model.kernel), frame.boundary, scene.box)
+        return self._exact.predict(inputs.double())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,141 +60,166 @@ class Thresholds:
     """What a stable model must hold.
 
     Attributes:
-        stressed_error: Largest error on a stressed frame, by the variance of that frame's own target.
-        regime_error: Largest error in a regime, by the variance of the target over the training split.
-        precision: Largest difference of float32 from float64, by the root mean square of the prediction.
-        density: Largest deviation of an integrated density from its reference, relative; 0.02 as Neural SPH.
+        stressed_error: Largest error in a stressed state, mean square by that of the target over the same particles, or
+            by a tenth of the target's variance over the validation frames if that is larger.
+        regime_error: The same for the particles of a regime.
+        still: Largest rate of density at rest and in uniform motion, by the same measure.
+        precision: Largest difference of float32 from float64, by the root of the variance.
+        density: Largest deviation of an integrated density, relative; 0.02 as Neural SPH.
     """
 
-    stressed_error: float = 0.5
-    regime_error: float = 0.5
+    stressed_error: float = 0.1
+    regime_error: float = 0.1
+    still: float = 0.1
     precision: float = 1e-3
     density: float = 0.02
 
 
-def measure_stability(
-    model: FieldModel, trajectories: Sequence[Trajectory], scene: Scene, thresholds: Thresholds | None = None
-) -> dict:
-    """All checks of a model, as they stand in summary.json.
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What a check measured.
+
+    Attributes:
+        check: "regime", "stress", "still", "precision" or "density".
+        label: What was looked at: the regime or state.
+        value: What was measured.
+        limit: What it must not exceed.
+        detail: What else a reader needs, such as the frame.
+    """
+
+    check: str
+    label: str
+    value: float
+    limit: float
+    detail: str = ""
+
+    @property
+    def passes(self) -> bool:
+        """Whether the limit is kept; what is no number does not keep it."""
+        return self.value <= self.limit
+
+
+def measure_stability(seeds: Mapping[str, Predictor], probes: Probes, thresholds: Thresholds | None = None) -> dict:
+    """All checks of a model's seeds, as they stand in summary.json; each number is that of the worst seed.
 
     Args:
-        model: The model.
-        trajectories: Trajectories that the model was not trained on.
-        scene: Their scene.
+        seeds: Each training of the model, by name.
+        probes: What they are asked.
         thresholds: What must hold.
 
     Returns:
-        "regimes", "stress", "precision", "density_rollout" (None unless the model predicts the density rate), "stable",
-        "failures" (one line each) and "thresholds".
+        "regimes", "stress", "still" (tasks that predict a rate), "precision", "density_rollout" (None for others),
+        "stable", "failures" (one line each, with the seeds if there are several), "thresholds" and "counts" (seeds and
+        frames that were looked at).
     """
     thresholds = thresholds or Thresholds()
-    frame = trajectories[0][len(trajectories[0]) // 2]
-    rollout = density_rollout(model, trajectories[0], scene) if model.config.task == "density_rate" else None
-    checks = {
-        "regimes": regime_errors(model, [frame for trajectory in trajectories for frame in trajectory], scene),
-        "stress": {name: stressed_error(model, *stressed) for name, stressed in stressed_frames(frame, scene).items()},
-        "precision": precision(model, frame, scene),
-        "density_rollout": rollout,
-    }
-    failures = _failures(checks, thresholds)
-    return {**checks, "stable": not failures, "failures": failures, "thresholds": asdict(thresholds)}
-
-
-def regime_errors(model: FieldModel, frames: Sequence[Frame], scene: Scene) -> dict[str, dict]:
-    """Error and share of the particles of each regime: near walls, at the free surface, in the bulk; by number of
-    neighbours and by speed, a quarter of the particles each.
-
-    Near walls: a boundary point within 2 spacings. At the surface: elsewhere, with less than three quarters of the
-    median number of neighbours within 2 spacings.
-    """
-    parts = [_particles(model, frame, scene) for frame in frames]
-    errors, neighbors, near_wall, speeds = (torch.cat(values) for values in zip(*parts, strict=True))
-    sparse = neighbors < 0.75 * neighbors.median()
-    regimes = {
-        "near_wall": near_wall,
-        "free_surface": ~near_wall & sparse,
-        "bulk": ~near_wall & ~sparse,
-        **_quarters("neighbors", neighbors),
-        **_quarters("speed", speeds),
-    }
+    rollouts = {name: density_rollout(seed, probes, thresholds.density) for name, seed in seeds.items()}
+    findings = {name: findings_of(seed, probes, thresholds, rollouts[name]) for name, seed in seeds.items()}
+    worst = _worst(findings)
+    values = {check: {} for check in ("regime", "stress", "still", "precision", "density")}
+    for finding in worst:
+        values[finding.check][finding.label] = finding.value
+    failures = _failures(findings, worst)
     return {
-        name: {"normalized_mse": _finite(errors[members].mean()), "share": float(members.double().mean())}
-        for name, members in regimes.items()
-        if members.any()
+        "regimes": {
+            name: {"normalized_mse": value, "share": probes.regimes[name].share}
+            for name, value in values["regime"].items()
+        },
+        "stress": values["stress"],
+        **({"still": values["still"]} if values["still"] else {}),
+        "precision": max(values["precision"].values()),
+        "density_rollout": max(rollouts.values(), key=lambda each: each["largest"]) if probes.rollout else None,
+        "stable": not failures,
+        "failures": failures,
+        "thresholds": asdict(thresholds),
+        "counts": {
+            "seeds": len(seeds),
+            "plain_frames": len(probes.plain),
+            "stressed_frames": len({probe.origin for probe in probes.stressed}),
+        },
     }
 
 
-def stressed_error(model: FieldModel, frame: Frame, scene: Scene) -> float | None:
-    """Mean squared error of a frame by the variance of its own target; None where that is constant."""
-    (error,) = frame_errors(model, [make_sample(frame, scene, model.config.task, model.kernel)])
-    relative = error.per_frame_normalized_mse
-    return None if relative is None else _finite(relative)
+def findings_of(predictor: Predictor, probes: Probes, thresholds: Thresholds, rollout: Mapping | None) -> list[Finding]:
+    """What every check finds in one predictor, given its rollout."""
+    findings = [
+        *(
+            Finding(check="regime", label=name, value=error, limit=thresholds.regime_error)
+            for name, error in regime_errors(predictor, probes).items()
+        ),
+        *_of_states("stress", predictor, probes.stressed, thresholds.stressed_error),
+        *_of_states("still", predictor, probes.still, thresholds.still),
+        *_precision(predictor, probes, thresholds.precision),
+    ]
+    if rollout is not None:
+        first = rollout["first_frame_outside"]
+        detail = "" if first is None else f"first at frame {first} of {rollout['frames']}"
+        findings.append(
+            Finding(
+                check="density",
+                label="integrated density",
+                value=rollout["largest"],
+                limit=thresholds.density,
+                detail=detail,
+            )
+        )
+    return findings
 
 
-def stressed_frames(frame: Frame, scene: Scene, seed: int = 0) -> dict[str, tuple[Frame, Scene]]:
-    """A frame as it is, and in states in which methods fail, each with its scene.
-
-    Clumped pairs, stretched and compressed along the first axis, isolated particles, half and double spacing of the
-    same particles, turned and mirrored, and ten times as fast.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    axis = torch.zeros(scene.dim, dtype=torch.float64)
-    axis[0] = 1.0
-
-    def scaled(factors: Tensor) -> tuple[Frame, Scene]:
-        return _moved(frame, scene, torch.diag(factors), lambda velocities: velocities)
-
-    ones = torch.ones(scene.dim, dtype=torch.float64)
-    stressed = {
-        "as_it_is": (frame, scene),
-        "clumped": (_clumped(frame, scene, generator), scene),
-        "stretched": scaled(ones + 0.3 * axis),
-        "compressed": scaled(ones - 0.15 * axis),
-        "isolated": (_isolated(frame, scene, generator), scene),
-        "half_spacing": scaled(0.5 * ones),
-        "double_spacing": scaled(2.0 * ones),
-        "mirrored": _turned(frame, scene, torch.diag(ones - 2 * axis)),
-        "ten_times_as_fast": (replace(frame, velocities=10 * frame.velocities), scene),
-    }
-    if scene.dim > 1:
-        quarter = torch.eye(scene.dim, dtype=torch.float64)
-        quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-        stressed["turned"] = _turned(frame, scene, quarter)
-    return stressed
+def regime_errors(predictor: Predictor, probes: Probes) -> dict[str, float]:
+    """Mean squared error in each regime by its scale."""
+    errors = torch.cat([squared_errors(predictor, probe) for probe in probes.plain])
+    return {name: _finite(errors[each.members].mean() / each.scale) for name, each in probes.regimes.items()}
 
 
-@torch.no_grad()
-def precision(model: FieldModel, frame: Frame, scene: Scene) -> float:
-    """Largest difference between predictions in float32 and float64, by the root mean square of the prediction."""
-    sample = make_sample(frame, scene, model.config.task, model.kernel)
-    exact = deepcopy(model).double().predict(sample.inputs.double())
-    difference = (model.predict(sample.inputs).double() - exact).abs().max()
-    return _finite(difference / exact.square().mean().sqrt().clamp_min(torch.finfo(torch.float64).tiny))
+def stressed_error(predictor: Predictor, probe: Probe) -> float:
+    """Mean squared error of the affected particles by the probe's scale; 0 if there are none."""
+    if not probe.affected.any():
+        return 0.0
+    return _finite(squared_errors(predictor, probe)[probe.affected].mean() / probe.scale)
 
 
-@torch.no_grad()
-def density_rollout(model: FieldModel, trajectory: Trajectory, scene: Scene, limit: float = 0.02) -> dict:
-    """Dρ/Dt along a stored trajectory, integrated by the trapezoidal rule: the model's and the analytic one.
+def squared_errors(predictor: Predictor, probe: Probe) -> Tensor:
+    """Squared error of each fluid particle, mean over components, (N,), float64."""
+    return (predictor.predict(probe.frame, probe.scene).double() - probe.target).square().mean(dim=1)
+
+
+def precision(predictor: Predictor, probe: Probe, typical: float) -> float:
+    """Largest difference between predictions in float32 and float64, by the root of the typical mean square."""
+    exact = predictor.predict_exactly(probe.frame, probe.scene).double()
+    return _finite((predictor.predict(probe.frame, probe.scene).double() - exact).abs().max() / math.sqrt(typical))
+
+
+def density_rollout(predictor: Predictor, probes: Probes, limit: float = 0.02) -> dict | None:
+    r"""Deviation of the density that follows from a predicted rate, along stored frames.
+
+    The analytic rate is exactly the derivative of the summed density (`cconv.sph.density_rate`), so that integrated
+    without error it leads back to it, and the predicted rate to
+
+    .. math:: \rho_i(t) + \int_0^t (\dot\rho^\text{model}_i - \dot\rho_i)\, dt'
+
+    Only that integral is taken from stored frames, by the trapezoidal rule: what the rule misses of the rate itself,
+    since frames may lie far apart, is common to both rates and cancels.
 
     Returns:
         "frames"; "drift", the mean relative deviation at the last frame; "largest", the deviation that nineteen of
-        twenty particles keep; "first_frame_outside", the first at which it exceeds `limit`, or None.
+        twenty particles keep; "first_frame_outside", the first at which it exceeds `limit`, or None;
+        "analytic_by_frames", how far the analytic rate alone, integrated over frames, is off. None without a rollout.
     """
-    rates, references = [], []
-    for frame in trajectory:
-        sample = make_sample(frame, scene, model.config.task, model.kernel)
-        rates.append(model.predict(sample.inputs)[:, 0].double())
-        references.append(sample.target[:, 0].double())
-    start = fluid_state(trajectory[0], scene.box, model.kernel).densities
-    integrated, reference = (_integrate(start, torch.stack(values), scene.frame_dt) for values in (rates, references))
-    deviations = integrated / reference - 1
-    usual = deviations.abs().quantile(0.95, dim=1)
+    rollout = probes.rollout
+    if rollout is None:
+        return None
+    rates = torch.stack([predictor.predict(frame, rollout.scene)[:, 0].double() for frame in rollout.frames])
+    deviations = _integrated(rates - rollout.targets, rollout) / rollout.densities
+    usual = deviations.abs().nan_to_num(math.inf).quantile(USUAL, dim=1)
     outside = (~(usual <= limit)).nonzero()[:, 0]
+    alone = (rollout.densities[0] + _integrated(rollout.targets, rollout)) / rollout.densities - 1
     return {
-        "frames": len(trajectory),
+        "frames": len(rollout.frames),
         "drift": _finite(deviations[-1].mean()),
         "largest": _finite(usual.max()),
         "first_frame_outside": int(outside[0]) if len(outside) else None,
+        "analytic_by_frames": _finite(alone.abs().quantile(USUAL, dim=1).max()),
     }
 
 
@@ -172,123 +227,67 @@ def _finite(value: Tensor | float) -> float:
     return float(value) if math.isfinite(value) else NOT_FINITE
 
 
-def _integrate(start: Tensor, rates: Tensor, dt: float) -> Tensor:
-    steps = dt * (rates[1:] + rates[:-1]) / 2
-    return torch.cat([start[None], start + steps.cumsum(dim=0)])
+def _integrated(rates: Tensor, rollout: Rollout) -> Tensor:
+    """Integral (T, N) of rates (T, N) from the first frame to each, by the trapezoidal rule."""
+    steps = rollout.scene.frame_dt * (rates[1:] + rates[:-1]) / 2
+    return torch.cat([torch.zeros_like(rates[:1]), steps.cumsum(dim=0)])
 
 
-def _failures(checks: Mapping, thresholds: Thresholds) -> list[str]:
-    failures = [
-        f"error {regime['normalized_mse']:.3g} in regime {name} (limit {thresholds.regime_error:g})"
-        for name, regime in checks["regimes"].items()
-        if not regime["normalized_mse"] <= thresholds.regime_error
+def _of_states(check: str, predictor: Predictor, probes: Sequence[Probe], limit: float) -> Iterable[Finding]:
+    """The worst of each state over the frames that were put into it."""
+    found = [
+        Finding(check=check, label=probe.name, value=stressed_error(predictor, probe), limit=limit, detail=probe.origin)
+        for probe in probes
     ]
-    failures += [
-        f"error {error:.3g} on the frame {name} (limit {thresholds.stressed_error:g})"
-        for name, error in checks["stress"].items()
-        if error is not None and not error <= thresholds.stressed_error
+    return _largest_by_label(found)
+
+
+def _precision(predictor: Predictor, probes: Probes, limit: float) -> Iterable[Finding]:
+    found = [
+        Finding(
+            check="precision",
+            label="float32",
+            value=precision(predictor, probe, probes.typical),
+            limit=limit,
+            detail=f"{probe.name}, {probe.origin}",
+        )
+        for probe in probes.stressed
+        if probe.name in PRECISE_STATES
     ]
-    if not checks["precision"] <= thresholds.precision:
-        failures.append(f"float32 is {checks['precision']:.3g} from float64 (limit {thresholds.precision:g})")
-    rollout = checks["density_rollout"]
-    if rollout and not rollout["largest"] <= thresholds.density:
-        failures.append(
-            f"integrated density deviates by {rollout['largest']:.3g} (limit {thresholds.density:g}), "
-            f"first at frame {rollout['first_frame_outside']}"
-        )
-    return failures
+    return _largest_by_label(found)
 
 
-@torch.no_grad()
-def _particles(model: FieldModel, frame: Frame, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Squared error, number of neighbours, whether a wall is near, and speed of each fluid particle."""
-    sample = make_sample(frame, scene, model.config.task, model.kernel)
-    inputs = sample.inputs
-    predicted = model(inputs, model.geometry(inputs))
-    errors = (predicted - model.standardize_target(sample.target)).double().square().mean(dim=1)
-    edges = radius_graph(inputs.positions, NEAR * scene.particle_spacing, scene.box)
-    near = torch.zeros(inputs.num_particles, dtype=torch.bool)
-    if frame.boundary is not None:
-        walls = radius_graph(
-            inputs.boundary_positions, NEAR * scene.particle_spacing, scene.box, queries=inputs.positions
-        )
-        near = walls.row_splits.diff() > 0
-    speeds = frame.velocities[frame.particle_types == ParticleType.FLUID].double().norm(dim=1)
-    return errors, edges.row_splits.diff().double(), near, speeds
+def _largest_by_label(findings: Iterable[Finding]) -> list[Finding]:
+    ordered = sorted(findings, key=lambda each: each.label)
+    largest = {
+        label: max(group, key=lambda each: each.value) for label, group in groupby(ordered, lambda each: each.label)
+    }
+    return [largest[label] for label in dict.fromkeys(each.label for each in findings)]
 
 
-def _quarters(name: str, values: Tensor) -> dict[str, Tensor]:
-    """Members of the four quarters of the particles by a value; equal values stay together."""
-    edges = torch.from_numpy(np.quantile(values.numpy(), [0.25, 0.5, 0.75]))
-    places = torch.searchsorted(edges, values)
-    return {f"{name}_quarter_{quarter + 1}": places == quarter for quarter in range(4)}
+def _worst(findings: Mapping[str, Sequence[Finding]]) -> list[Finding]:
+    """The finding with the largest value of each check and label, over seeds."""
+    return [max(same, key=lambda each: each.value) for same in zip(*findings.values(), strict=True)]
 
 
-def _moved(
-    frame: Frame, scene: Scene, matrix: Tensor, of_velocities: Callable[[Tensor], Tensor]
-) -> tuple[Frame, Scene]:
-    """A frame whose points are mapped by a diagonal or signed permutation matrix (D, D), with its box."""
-    corners = torch.tensor([scene.box.lower, scene.box.upper], dtype=torch.float64) @ matrix.T
-    periodic = tuple(bool(axis) for axis in matrix.abs() @ torch.tensor(scene.box.periodic, dtype=torch.float64) > 0)
-    box = Box(corners.amin(dim=0).tolist(), corners.amax(dim=0).tolist(), periodic)
-
-    def mapped(points: Tensor) -> Tensor:
-        return (points.double() @ matrix.T).to(points.dtype)
-
-    boundary = frame.boundary
-    if boundary is not None:
-        normals = None if boundary.normals is None else of_velocities(boundary.normals)
-        boundary = Boundary(positions=mapped(boundary.positions), normals=normals)
-    positions = box.wrap(mapped(frame.positions))
-    moved = replace(frame, positions=positions, velocities=of_velocities(frame.velocities), boundary=boundary)
-    return moved, replace(scene, box=box)
+def _failures(findings: Mapping[str, Sequence[Finding]], worst: Sequence[Finding]) -> list[str]:
+    """A line for each finding beyond its limit, with the seeds that it is of."""
+    lines = []
+    for place, finding in enumerate(worst):
+        if not finding.passes:
+            seeds = [name for name, found in findings.items() if not found[place].passes]
+            where = [finding.detail] if finding.detail else []
+            where += [f"seeds {', '.join(seeds)} of {len(findings)}"] if len(findings) > 1 else []
+            lines.append("; ".join([_in_words(finding), *where]))
+    return lines
 
 
-def _turned(frame: Frame, scene: Scene, matrix: Tensor) -> tuple[Frame, Scene]:
-    return _moved(frame, scene, matrix, lambda vectors: (vectors.double() @ matrix.T).to(vectors.dtype))
-
-
-def _clumped(frame: Frame, scene: Scene, generator: torch.Generator) -> Frame:
-    """One fluid particle in twenty is put a tenth of a spacing beside its nearest neighbour."""
-    fluid = (frame.particle_types == ParticleType.FLUID).nonzero()[:, 0]
-    positions = frame.positions.double().clone()
-    edges = radius_graph(positions[fluid], NEAR * scene.particle_spacing, scene.box)
-    for particle in torch.randperm(len(fluid), generator=generator)[: max(1, len(fluid) // 20)].tolist():
-        row = slice(int(edges.row_splits[particle]), int(edges.row_splits[particle + 1]))
-        if row.start == row.stop:
-            continue
-        nearest = row.start + int(edges.distances[row].argmin())
-        direction = edges.displacements[nearest] / edges.distances[nearest].clamp_min(1e-12)
-        target = positions[fluid[edges.senders[nearest]]]
-        positions[fluid[particle]] = target + 0.1 * scene.particle_spacing * direction
-    return replace(frame, positions=scene.box.wrap(positions).to(frame.positions.dtype))
-
-
-def _isolated(frame: Frame, scene: Scene, generator: torch.Generator) -> Frame:
-    """Five fluid particles lose all neighbours within four spacings but one, or all."""
-    fluid = (frame.particle_types == ParticleType.FLUID).nonzero()[:, 0]
-    chosen = torch.randperm(len(fluid), generator=generator)[:5]
-    edges = radius_graph(frame.positions[fluid].double(), 4 * scene.particle_spacing, _fitting(scene, 4.0))
-    lost = torch.zeros(len(fluid), dtype=torch.bool)
-    for number, particle in enumerate(chosen.tolist()):
-        senders = edges.senders[edges.row_splits[particle] : edges.row_splits[particle + 1]]
-        lost[senders[number % 2 :]] = True
-    lost[chosen] = False
-    keep = torch.ones(len(frame.positions), dtype=torch.bool)
-    keep[fluid[lost]] = False
-    return replace(
-        frame,
-        positions=frame.positions[keep],
-        velocities=frame.velocities[keep],
-        masses=frame.masses[keep],
-        particle_types=frame.particle_types[keep],
-    )
-
-
-def _fitting(scene: Scene, spacings: float) -> Box:
-    """The scene's box, open where it is too narrow for a search of so many spacings."""
-    reach = 2 * spacings * scene.particle_spacing
-    periodic = tuple(
-        wraps and length >= reach for wraps, length in zip(scene.box.periodic, scene.box.lengths, strict=True)
-    )
-    return Box(scene.box.lower, scene.box.upper, periodic)
+def _in_words(finding: Finding) -> str:
+    limit = f"(limit {finding.limit:g})"
+    return {
+        "regime": f"error {finding.value:.3g} in regime {finding.label} {limit}",
+        "stress": f"error {finding.value:.3g} on the frame {finding.label} {limit}",
+        "still": f"rate {finding.value:.3g} where nothing changes, {finding.label} {limit}",
+        "precision": f"{finding.label} is {finding.value:.3g} from float64 {limit}",
+        "density": f"{finding.label} deviates by {finding.value:.3g} {limit}",
+    }[finding.check]

@@ -49,6 +49,8 @@ def verdict_matrix(summary: Mapping) -> list[Check]:
         checks.append(_check(label, limits["regime_error"], measured, ("regimes", regime, "normalized_mse")))
     for frame in first["stress"]:
         checks.append(_check(f"frame {_words(frame)}", limits["stressed_error"], measured, ("stress", frame)))
+    for state in first.get("still", {}):  # of tasks that predict a rate
+        checks.append(_check(f"nothing changes: {_words(state)}", limits["still"], measured, ("still", state)))
     checks.append(_check("float32 from float64", limits["precision"], measured, ("precision",)))
     if first["density_rollout"]:
         keys = ("density_rollout", "largest")

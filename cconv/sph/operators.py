@@ -31,7 +31,7 @@ def density(masses: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
         ShapeError: If `masses` does not fit the edges.
         ConfigError: If the edges do not reach as far as the kernel, or differ from it in dimension.
     """
-    _check(edges, kernel, masses=(masses, (edges.num_senders,)))
+    check_sum(edges, kernel, masses=(masses, (edges.num_senders,)))
     rho = _sum_over_neighbours(masses[edges.senders] * kernel.value(edges.distances), edges)
     if edges.bipartite or edges.includes_self:
         return rho
@@ -56,9 +56,9 @@ def density_rate(masses: Tensor, velocities: Tensor, edges: Edges, kernel: Abstr
         ShapeError: If shapes do not fit the edges.
         ConfigError: If the edges are bipartite, do not reach as far as the kernel, or differ from it in dimension.
     """
-    _check_one_set(edges)
+    check_one_set(edges)
     particles = edges.num_senders
-    _check(edges, kernel, masses=(masses, (particles,)), velocities=(velocities, (particles, edges.dim)))
+    check_sum(edges, kernel, masses=(masses, (particles,)), velocities=(velocities, (particles, edges.dim)))
     difference = velocities[edges.receivers] - velocities[edges.senders]
     terms = masses[edges.senders] * (difference * kernel_gradient(edges, kernel)).sum(dim=1)
     return _sum_over_neighbours(terms, edges)
@@ -85,9 +85,9 @@ def density_gradient(masses: Tensor, densities: Tensor, edges: Edges, kernel: Ab
         ShapeError: If shapes do not fit the edges.
         ConfigError: If the edges are bipartite, do not reach as far as the kernel, or differ from it in dimension.
     """
-    _check_one_set(edges)
+    check_one_set(edges)
     particles = edges.num_senders
-    _check(edges, kernel, masses=(masses, (particles,)), densities=(densities, (particles,)))
+    check_sum(edges, kernel, masses=(masses, (particles,)), densities=(densities, (particles,)))
     difference = densities[edges.senders] - densities[edges.receivers]
     terms = (masses[edges.senders] * difference)[:, None] * kernel_gradient(edges, kernel)
     return _sum_over_neighbours(terms, edges) / densities[:, None]
@@ -104,7 +104,14 @@ def _sum_over_neighbours(terms: Tensor, edges: Edges) -> Tensor:
     return terms.new_zeros(edges.num_receivers, *terms.shape[1:]).index_add(0, edges.receivers, terms)
 
 
-def _check(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[int, ...]]) -> None:
+def check_sum(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[int, ...]]) -> None:
+    """Raise `ShapeError` or `ConfigError` unless a sum with the kernel can be taken over the edges.
+
+    Args:
+        edges: Pairs to sum over.
+        kernel: W.
+        tensors: What is summed, each with the shape that it must have.
+    """
     for name, (tensor, shape) in tensors.items():
         check_shape(name, tensor.shape, shape)
     if edges.dim != kernel.dim:
@@ -116,7 +123,8 @@ def _check(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[
         )
 
 
-def _check_one_set(edges: Edges) -> None:
+def check_one_set(edges: Edges) -> None:
+    """Raise `ConfigError` if the edges join two sets of points."""
     if edges.bipartite:
         raise ConfigError(
             "`edges` must join the particles of one set, got bipartite edges; build them with "

@@ -8,13 +8,13 @@ from itertools import islice
 
 import numpy as np
 
-from cconv.data.features import fluid_state
 from cconv.data.splits import evenly_spaced
-from cconv.data.targets import TASKS, Sample
-from cconv.evaluation.cost import Cost, measure_analytic, measure_costs, measure_growth
+from cconv.data.targets import Sample
+from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
-from cconv.evaluation.stability import measure_stability
-from cconv.sph.kernels import kernel_named
+from cconv.evaluation.probes import make_probes
+from cconv.evaluation.stability import ModelPredictor, measure_stability
+from cconv.sph.kernels import AbstractKernel, kernel_named
 from cconv.study.budget import budget_words
 from cconv.study.costs import points_of_search
 from cconv.study.finalists import (
@@ -26,7 +26,7 @@ from cconv.study.finalists import (
     retrained_finalists,
 )
 from cconv.study.front import attainment, bootstrap_hypervolume
-from cconv.study.problem import study_samples
+from cconv.study.problem import Problem, study_samples
 from cconv.study.records import RunFolder, count_outcomes
 from cconv.study.selection import Recommendation, pareto_front, recommend
 from cconv.study.session import Session
@@ -49,7 +49,7 @@ def select(session: Session, stage: str) -> dict:
     check_any_finished(run, finalists, failed)
     samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
     tests, errors = _test(session, finalists, samples)
-    timed = _time(session, finalists)
+    timed, analytic = _time(session, finalists)
     costs = {finalist.id: timed[finalist.id] for finalist in finalists}
     stability = _stress(session, finalists)
     chosen = recommend(
@@ -79,7 +79,7 @@ def select(session: Session, stage: str) -> dict:
         "recommended": {"id": chosen.id, "reason": chosen.reason},
         "selection": _selection(chosen, study.selection.margin),
         **points_of_search(session.count_cost, run.trials(), timed),
-        "analytic": _analytic(session),
+        "analytic": asdict(analytic),
         "growth": _growth(session, finalists),
         "trials": _counts(run),
         **found,
@@ -103,36 +103,40 @@ def _test(
     return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
 
 
-def _time(session: Session, finalists: Sequence[Retrained]) -> dict[str, Cost]:
-    """Time of the finalists, and of some trials from the cheapest to the costliest, all in turn."""
-    inputs = [sample.inputs for sample in session.problem.valid_samples[:TIMED_FRAMES]]
-    settings, run = session.study.cost, session.run
+def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
+    """Time of the finalists, of some trials from the cheapest to the costliest, and of the analytic field, in turn."""
+    settings, run, problem = session.study.cost, session.run, session.problem
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     trials = [record for record in run.trials() if record.last is not None and record.id not in checkpoints]
     trials.sort(key=lambda record: record.config["flops_per_particle"])
     chosen = [trials[place] for place in evenly_spaced(len(trials), settings.trials)] if trials else []
     checkpoints |= {record.id: run.trial(record.id).checkpoint for record in chosen}
-    return measure_costs(checkpoints, load_model, inputs, threads=settings.threads, repeats=settings.repeats)
-
-
-def _analytic(session: Session) -> dict:
-    """Time of the analytic field on the frames that the finalists are timed on."""
-    study, problem, scene = session.study, session.problem, session.dataset.scene
-    kernel = kernel_named(problem.kernel)(problem.smoothing_length, scene.dim)
-    frames = islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES)
-    states = [fluid_state(frame, scene.box, kernel).single() for frame in frames]
-    settings = study.cost
-    return measure_analytic(
-        states, scene.box, TASKS[study.task], kernel, threads=settings.threads, repeats=settings.repeats
+    frames = list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
+    return measure_costs(
+        checkpoints,
+        load_model,
+        frames,
+        session.dataset.scene,
+        task=problem.task,
+        kernel=_kernel(problem),
+        threads=settings.threads,
+        repeats=settings.repeats,
     )
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
-    """Time of the finalists on blocks of fluid of growing size."""
+    """Time of the finalists and of the analytic field on blocks of fluid of growing size."""
     settings = session.study.cost
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     sizes = settings.sizes
-    grown = measure_growth(checkpoints, load_model, sizes=sizes, threads=settings.threads, repeats=GROWTH_REPEATS)
+    grown = measure_growth(
+        checkpoints,
+        load_model,
+        analytic=load_model(finalists[0].best_checkpoint).config,
+        sizes=sizes,
+        threads=settings.threads,
+        repeats=GROWTH_REPEATS,
+    )
     return {
         "sizes": list(sizes),
         "models": {name: [asdict(time) for time in growth.times] for name, growth in grown.items()},
@@ -142,12 +146,25 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
 
 
 def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]:
-    """Stability on validation trajectories; it decides, and the test split is only looked at for its errors."""
-    trajectories, scene = list(session.dataset.trajectories("valid")), session.dataset.scene
+    """Stability of every seed on validation trajectories; the test split is only looked at for its errors."""
+    problem, scene = session.problem, session.dataset.scene
+    trajectories = list(session.dataset.trajectories("valid"))
+    reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
+    probes = make_probes(trajectories, scene, problem.task, _kernel(problem), reach)
     return {
-        finalist.id: measure_stability(load_model(finalist.best_checkpoint), trajectories, scene)
+        finalist.id: measure_stability(
+            {
+                record.id: ModelPredictor(load_model(checkpoint))
+                for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True)
+            },
+            probes,
+        )
         for finalist in session.progress(finalists, "stability")
     }
+
+
+def _kernel(problem: Problem) -> AbstractKernel:
+    return kernel_named(problem.kernel)(problem.smoothing_length, problem.scene.dim)
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:

@@ -224,7 +224,7 @@ def in_turn(calls: dict[str, Callable[[], None]], seconds: float) -> dict[str, l
 def summary(times: dict[str, list[float]]) -> list[dict]:
     rows = []
     for variant, values in times.items():
-        low, median, high = statistics.quantiles(values, n=4)
+        low, median, high = statistics.quantiles(values, n=4, method="inclusive")
         rows.append({"variant": variant, "ms": median, "low": low, "high": high, "repeats": len(values)})
     return rows
 

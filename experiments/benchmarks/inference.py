@@ -26,7 +26,7 @@ import torch
 
 from cconv import open_dataset, radius_graph
 from cconv.data.targets import Sample, make_sample
-from cconv.data.trajectory import Scene
+from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
 from cconv.sph import CubicSpline
 from cconv.training.checkpoint import load_model, save_model
@@ -58,10 +58,13 @@ SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000,
 SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
 
 
-def frame_of(folder: Path) -> tuple[Scene, Sample]:
+def frame_of(folder: Path) -> tuple[Scene, Frame]:
     dataset = open_dataset(folder, mass=0.125, particle_spacing=SPACING, frame_dt=1 / 60)
-    frame = dataset.trajectory("train", 0)[20]
-    return dataset.scene, make_sample(frame, dataset.scene, "density_rate", CubicSpline(SPACING, DIM))
+    return dataset.scene, dataset.trajectory("train", 0)[20]
+
+
+def sample_of(scene: Scene, frame: Frame) -> Sample:
+    return make_sample(frame, scene, "density_rate", CubicSpline(SPACING, DIM))
 
 
 def model_of(settings: Mapping, scene: Scene, sample: Sample) -> FieldModel:
@@ -80,7 +83,8 @@ class Calls:
     """What a state of the code is timed on, by name; each call returns its parts' times in ms."""
 
     def __init__(self, folder: Path, searches: list[tuple[int, int, bool]]):
-        scene, sample = frame_of(folder)
+        scene, frame = frame_of(folder)
+        sample = sample_of(scene, frame)
         self.known = set(NetworkConfig.model_fields)
         self.calls = {}
         for name, settings in COMPARED.items():
@@ -135,7 +139,7 @@ class State:
 
 
 def quartiles(values: list[float]) -> dict[str, float]:
-    low, median, high = statistics.quantiles(values, n=4)
+    low, median, high = statistics.quantiles(values, n=4, method="inclusive")
     return {"median": median, "low": low, "high": high}
 
 
@@ -180,15 +184,26 @@ def measure_checks(data: Path, rounds: int) -> dict:
     from cconv.evaluation.cost_model import estimate
     from cconv.evaluation.time_model import check_cost_model
 
-    scene, sample = frame_of(data)
+    scene, frame = frame_of(data)
+    sample = sample_of(scene, frame)
     around = surroundings_of(sample.inputs, 2.0, SPACING)
     with tempfile.TemporaryDirectory() as folder:
         saved = {name: Path(folder) / str(place) for place, name in enumerate(CHECKED)}
         for name, path in saved.items():
             save_model(model_of(CHECKED[name], scene, sample), path, {})
         compared = {name: saved[name] for name in COMPARED}
-        growth = measure_growth(compared, load_model, threads=1, repeats=max(2, rounds // 4))
-        costs = measure_costs(saved, load_model, [sample.inputs], threads=1, repeats=max(2, rounds // 2))
+        field = load_model(saved["published network"]).config
+        growth = measure_growth(compared, load_model, analytic=field, threads=1, repeats=max(2, rounds // 4))
+        costs, analytic = measure_costs(
+            saved,
+            load_model,
+            [frame],
+            scene,
+            task="density_rate",
+            kernel=CubicSpline(SPACING, DIM),
+            threads=1,
+            repeats=max(2, rounds // 2),
+        )
     counted = {
         name: estimate(
             NetworkConfig(**settings).model_dump(),
@@ -203,6 +218,7 @@ def measure_checks(data: Path, rounds: int) -> dict:
     return {
         "growth": {name: asdict(each) for name, each in growth.items()},
         "costs": {name: asdict(cost) for name, cost in costs.items()},
+        "analytic": asdict(analytic),
         "estimates": {name: asdict(each) for name, each in counted.items()},
         "cost_model": asdict(check),
     }
@@ -303,7 +319,7 @@ def main() -> None:
     checkouts["now"] = Path(__file__).parents[2]
     results = {
         "machine": f"{os.cpu_count()} cores, torch {torch.__version__}",
-        "num_particles": frame_of(arguments.data)[1].inputs.num_particles,
+        "num_particles": len(frame_of(arguments.data)[1].positions),
         "threads": 1,
         "compared": compare(checkouts, arguments.data, SEARCHES, arguments.rounds),
         **measure_checks(arguments.data, arguments.rounds),

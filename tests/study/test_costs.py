@@ -27,7 +27,7 @@ def record(number, parameters):
 
 def cost(us_per_particle):
     return Cost(
-        ms_per_frame=us_per_particle * 0.064, ms_low=0.0, ms_high=0.0, geometry_ms=0.0, network_ms=0.0,
+        ms_per_frame=us_per_particle * 0.064, ms_low=0.0, ms_high=0.0, geometry_ms=0.0, network_ms=0.0, turns_ms=(),
         us_per_particle=us_per_particle, peak_mb=0.0, flops_per_particle=0.0, threads=1, num_particles=64,
     )  # fmt: skip
 

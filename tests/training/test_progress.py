@@ -1,5 +1,7 @@
 """A training that was left goes on as if it had not been."""
 
+import itertools
+
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -42,7 +44,17 @@ def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, ne
     rest = list(train(second, given.train_samples, given.valid_samples, **OPTIONS, progress=restored))
     assert [state.train_loss for state in rest] == losses[left_at:]
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(second.parameters(), whole.parameters(), strict=True))
-    assert rest[-1].seconds > state.seconds
+
+
+def test_a_restored_training_counts_its_seconds_from_where_it_was(generator, monkeypatch):
+    """A clock of our own: every look at it takes a second."""
+    monkeypatch.setattr("cconv.training.loop.time.perf_counter", itertools.count().__next__)
+    given = problem(generator)
+    model = given.build_model(NETWORKS[0], 0)
+    progress = begin(model)
+    progress.seconds = 100
+    states = train(model, given.train_samples, given.valid_samples, **OPTIONS, progress=progress)
+    assert [next(states).seconds for _ in range(3)] == [101, 102, 103]
 
 
 def test_a_damaged_file_is_named(generator, tmp_path):

@@ -1,0 +1,240 @@
+"""Analytic SPH as a model, and the same spoiled in one situation: what a check of stability must pass, and catch."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+
+from cconv.data.features import fluid_state
+from cconv.data.targets import TASKS
+from cconv.domain import Box
+from cconv.neighbors import radius_graph
+
+
+@dataclass(frozen=True, kw_only=True)
+class Analytic:
+    """The analytic field of a task as a predictor, in float32 or float64."""
+
+    task: str
+    kernel: object
+    dtype: torch.dtype = torch.float32
+
+    def predict(self, frame, scene):
+        return self.field(self.state(frame, scene, self.dtype), frame, scene)
+
+    def predict_exactly(self, frame, scene):
+        return self.field(self.state(frame, scene, torch.float64), frame, scene)
+
+    def state(self, frame, scene, dtype):
+        state = fluid_state(frame, scene.box, self.kernel)
+        return state.single() if dtype == torch.float32 else state
+
+    def field(self, state, frame, scene):
+        return TASKS[self.task](state, self.kernel)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usual:
+    """What a planted fault knows of the data, as a trained model would.
+
+    Attributes:
+        spacing: Particle spacing.
+        neighbors: Median number of neighbours within two spacings.
+        fastest: Largest speed.
+        rate: Root of the mean square of the target.
+    """
+
+    spacing: float
+    neighbors: float
+    fastest: float
+    rate: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spoiled(Analytic):
+    """The analytic field with a fault.
+
+    Attributes:
+        usual: What the fault knows of the data.
+        fault: Field, state, frame, scene and `usual` to the spoiled field.
+    """
+
+    usual: Usual
+    fault: Callable
+
+    def field(self, state, frame, scene):
+        return self.fault(super().field(state, frame, scene), state, frame, scene, self.usual, self)
+
+
+def neighbors(state, scene, usual):
+    return radius_graph(state.positions.double(), 2 * usual.spacing, scene.box).row_splits.diff()
+
+
+def at(condition, spoiled, field):
+    return torch.where(condition[:, None], spoiled, field)
+
+
+def close_pairs_times(factor):
+    """Terms of pairs closer than 0.2 spacings times a factor; displacements scale the terms."""
+
+    def fault(field, state, frame, scene, usual, model):
+        close = state.edges.distances < 0.2 * usual.spacing
+        displacements = torch.where(close[:, None], factor * state.edges.displacements, state.edges.displacements)
+        spoiled = replace(state, edges=replace(state.edges, displacements=displacements))
+        return TASKS[model.task](spoiled, model.kernel)
+
+    return fault
+
+
+def explodes_beyond_20_times_the_speed(field, state, frame, scene, usual, model):
+    return at(state.velocities.norm(dim=1) > 20 * usual.fastest, 1e6 * field, field)
+
+
+def flips_where_crowded(field, state, frame, scene, usual, model):
+    return at(neighbors(state, scene, usual) > 4 / 3 * usual.neighbors, -field, field)
+
+
+def nan_when_alone(field, state, frame, scene, usual, model):
+    return at(neighbors(state, scene, usual) == 0, math.nan * field, field)
+
+
+def constant_when_alone(field, state, frame, scene, usual, model):
+    return at(neighbors(state, scene, usual) == 0, field + usual.rate, field)
+
+
+def flips_near_walls(field, state, frame, scene, usual, model):
+    walls = frame.boundary.positions.double()
+    near = radius_graph(walls, 1.5 * usual.spacing, scene.box, queries=state.positions.double())
+    return at(near.row_splits.diff() > 0, -field, field)
+
+
+def zero_at_the_surface(field, state, frame, scene, usual, model):
+    return at(neighbors(state, scene, usual) < 0.7 * usual.neighbors, 0 * field, field)
+
+
+def flips_when_turned(field, state, frame, scene, usual, model):
+    spread = state.velocities.var(dim=0)
+    return field if spread[0] > spread[1] else -field
+
+
+def flips_when_mirrored(field, state, frame, scene, usual, model):
+    x, v = state.positions - state.positions.mean(dim=0), state.velocities - state.velocities.mean(dim=0)
+    return field if (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum() >= 0 else -field
+
+
+def flips_at_half_density(field, state, frame, scene, usual, model):
+    sparse = neighbors(state, scene, usual).double().median() < 0.75 * usual.neighbors
+    return -field if sparse else field
+
+
+def wrong_for_stretched_lattices(field, state, frame, scene, usual, model):
+    """Spread of the neighbours along the first axis against that along the others."""
+    edges = radius_graph(state.positions.double(), 1.6 * usual.spacing, scene.box)
+    extents = edges.displacements.square().mean(dim=0)
+    return field if extents.min() > 0.8 * extents.max() else -field
+
+
+def depends_on_the_place(field, state, frame, scene, usual, model):
+    return field + 0.01 * usual.rate * state.positions[:, :1] / usual.spacing
+
+
+def depends_on_the_frame_of_reference(field, state, frame, scene, usual, model):
+    drift = state.velocities.mean(dim=0).norm()
+    return field + usual.rate * (drift > 3 * usual.fastest)
+
+
+def rate_of_a_translation(field, state, frame, scene, usual, model):
+    return field + 0.05 * usual.rate * state.velocities.mean(dim=0).norm() / usual.fastest
+
+
+def rate_at_rest(field, state, frame, scene, usual, model):
+    return field + 0.2 * usual.rate
+
+
+def drifts(field, state, frame, scene, usual, model):
+    """A bias that is small among the rates, so that no error at one time shows it."""
+    return field + 0.06 * usual.rate
+
+
+def cancels_in_float32(field, state, frame, scene, usual, model):
+    return (field + 1e5 * usual.rate) - 1e5 * usual.rate
+
+
+def flips_the_fastest_percent(field, state, frame, scene, usual, model):
+    speeds = state.velocities.norm(dim=1)
+    return at(speeds >= speeds.quantile(0.99), -field, field)
+
+
+def wrong_in_compressed_clumps(field, state, frame, scene, usual, model):
+    """Only clumps: fluid that is as dense everywhere is predicted as it is."""
+    counts = neighbors(state, scene, usual).double()
+    clump = (counts > 1.3 * usual.neighbors) & (counts > 1.2 * counts.median())
+    return at(clump, 0 * field, field)
+
+
+def ignores_periodic_axes(field, state, frame, scene, usual, model):
+    open_box = Box(scene.box.lower, scene.box.upper, False)
+    state = model.state(frame, replace(scene, box=open_box), state.positions.dtype)
+    return TASKS[model.task](state, model.kernel)
+
+
+def saturates(field, state, frame, scene, usual, model):
+    return 6 * usual.rate * torch.tanh(field / (6 * usual.rate))
+
+
+def even_in_the_velocities(field, state, frame, scene, usual, model):
+    """Right for the flow of the data; its reverse changes nothing."""
+    x, v = state.positions - state.positions.mean(dim=0), state.velocities - state.velocities.mean(dim=0)
+    turning = x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]
+    return field * turning.sum().sign()
+
+
+def flips_when_tilted(field, state, frame, scene, usual, model):
+    """Knows walls along the axes alone."""
+    return field if frame.boundary.normals.abs().amax(dim=1).min() > 0.99 else -field
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault, the words of the finding that must name it, and where it can be planted."""
+
+    spoil: Callable
+    named: str
+    tasks: tuple[str, ...] = ("density_rate", "density_gradient")
+    needs_walls: bool = False
+    needs_periodic: bool = False
+    needs_open: bool = False
+    in_3d: bool = False
+
+
+RATE = ("density_rate",)
+FAULTS = {
+    "sign flipped for pairs closer than 0.2 spacings": Fault(close_pairs_times(-1.0), "clumped", RATE, in_3d=True),
+    "zero for pairs closer than 0.2 spacings": Fault(close_pairs_times(0.0), "clumped", RATE),
+    "three times the truth for pairs closer than 0.2 spacings": Fault(close_pairs_times(3.0), "clumped", RATE),
+    "explosion beyond 20 times the largest speed": Fault(explodes_beyond_20_times_the_speed, "hundred_times_as_fast"),
+    "sign flipped where neighbours are a third more than usual": Fault(
+        flips_where_crowded, "forty_percent_denser", in_3d=True
+    ),
+    "no number for isolated particles": Fault(nan_when_alone, "isolated"),
+    "a constant for isolated particles": Fault(constant_when_alone, "isolated"),
+    "wrong near walls": Fault(flips_near_walls, "near_wall", needs_walls=True),
+    "zero at the free surface": Fault(zero_at_the_surface, "free_surface", needs_open=True),
+    "wrong when turned": Fault(flips_when_turned, "turned", in_3d=True),
+    "wrong when tilted": Fault(flips_when_tilted, "tilted", needs_walls=True),
+    "wrong when mirrored": Fault(flips_when_mirrored, "mirrored"),
+    "wrong at half density": Fault(flips_at_half_density, "half_density", in_3d=True),
+    "wrong for stretched lattices": Fault(wrong_for_stretched_lattices, "stretched"),
+    "dependence on the place": Fault(depends_on_the_place, "far_away"),
+    "dependence on the frame of reference": Fault(depends_on_the_frame_of_reference, "moving_frame"),
+    "rate of a translation": Fault(rate_of_a_translation, "uniform_velocity", RATE),
+    "rate at rest": Fault(rate_at_rest, "rest", RATE),
+    "a bias that drifts": Fault(drifts, "integrated density", RATE),
+    "cancellation in float32": Fault(cancels_in_float32, "float32"),
+    "wrong for the fastest one in a hundred": Fault(flips_the_fastest_percent, "fastest_percent"),
+    "wrong in compressed clumps": Fault(wrong_in_compressed_clumps, "squeezed"),
+    "periodic axes ignored": Fault(ignores_periodic_axes, "periodic_face", needs_periodic=True),
+    "saturation": Fault(saturates, "ten_times_as_fast", RATE),
+    "reversed flow taken as it was": Fault(even_in_the_velocities, "reversed", RATE),
+}
