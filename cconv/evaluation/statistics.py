@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from cconv.errors import DataError, ShapeError
 
@@ -120,7 +120,7 @@ def mean_interval(values: np.ndarray) -> tuple[float, float] | None:
     if why_no_interval(*values.shape):
         return None
     error, freedom = crossed_standard_error(values)
-    width = scipy.stats.t.ppf(0.975, freedom) * error
+    width = scipy.special.stdtrit(freedom, 0.975) * error if error else 0.0
     return float(values.mean() - width), float(values.mean() + width)
 
 

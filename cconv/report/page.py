@@ -61,18 +61,19 @@ def render_report(run: RunFolder) -> str:
         state=run.read("state.json"),
         environment=_read_if_there(run, "environment.json"),
         summary=summary,
-        **_search_parts(run),
+        **_search_parts(run, summary),
         **(_finished_parts(run, summary) if summary else {}),
     )
 
 
-def _search_parts(run: RunFolder) -> dict:
-    """What the trials show, also of a run that is not finished."""
+def _search_parts(run: RunFolder, summary: Mapping | None) -> dict:
+    """What the trials show, also of a run that is not finished, for which the mean predictor is not known yet."""
+    mean = {"mean_predictor": summary["mean_predictor"]["valid"] if summary else None}
     trials, curves = trials_table(run), curves_table(run)
     searched = not trials.empty and bool(trials["valid_normalized_mse"].notna().any())
     return {
-        "curves_chart": _picture(learning_curves_chart(curves)) if searched else None,
-        "search_chart": _picture(best_so_far_chart(trials)) if searched else None,
+        "curves_chart": _picture(learning_curves_chart(curves, **mean)) if searched else None,
+        "search_chart": _picture(best_so_far_chart(trials, **mean)) if searched else None,
         "trials": "" if trials.empty else _html(trials.sort_values("valid_normalized_mse")),
     }
 
@@ -112,11 +113,14 @@ def _comparison(summary: Mapping) -> dict:
 
 
 def _finalists_rows(summary: Mapping) -> list[dict]:
-    """Rows of the tables of finalists, most accurate first; each with its whole entry in the summary."""
+    """Rows of the tables of finalists, most accurate first; each with its whole entry in the summary.
+
+    The rows of the mean predictor and of analytic SPH are among them, without an entry.
+    """
     front = set(summary["pareto_front"])
     entries = {entry["id"]: entry for entry in summary["finalists"]}
     rows = finalists_table(summary).to_dict("records")
-    return [row | {"on_front": row["model"] in front, "entry": entries[row["model"]]} for row in rows]
+    return [row | {"on_front": row["model"] in front, "entry": entries.get(row["model"])} for row in rows]
 
 
 def _explained(run: RunFolder, summary: Mapping) -> dict | None:

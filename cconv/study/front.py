@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cconv.errors import DataError, ShapeError
-from cconv.evaluation.statistics import mean_interval, paired_logarithms
+from cconv.evaluation.statistics import mean_interval, paired_logarithms, why_no_interval
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ def hypervolume_interval(
         reference: (error, cost) of the corner.
 
     Returns:
-        "hypervolume", "ci95" (None where there are too few seeds or units) and "reference".
+        "value", "ci95" (None where "why_no_interval" has a reason) and "reference".
 
     Raises:
         ShapeError: If the models differ in their units.
@@ -123,8 +123,9 @@ def hypervolume_interval(
     )
     interval = mean_interval(area + deviations)
     return {
-        "hypervolume": area,
+        "value": area,
         "ci95": None if interval is None else [max(interval[0], 0.0), interval[1]],
+        "why_no_interval": why_no_interval(*shape),
         "reference": [float(value) for value in reference],
     }
 

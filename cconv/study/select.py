@@ -246,7 +246,7 @@ def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst:
     steps = zip(band["cost"], band["median"], band["low"], band["high"], strict=True)
     return {
         "attainment": [dict(zip(("ms_per_frame", "median", "low", "high"), step, strict=True)) for step in steps],
-        "hypervolume": {"value": area["hypervolume"], "ci95": area["ci95"], "reference": [corner[1], corner[0]]},
+        "hypervolume": area | {"reference": [corner[1], corner[0]]},
     }
 
 
