@@ -106,7 +106,7 @@ def test_an_interval_covers_as_it_says_over_all_sizes(name):
 @pytest.mark.parametrize("name", INTERVALS)
 def test_an_interval_covers_as_it_says_at_each_size(name, shape, spreads):
     rng = np.random.default_rng(1)
-    check(name, coverage(lambda: INTERVALS[name](rng, shape, spreads), 1500), 1500)
+    check(name, coverage(lambda: INTERVALS[name](rng, shape, spreads), 1000), 1000)
 
 
 def share_of_variances(rng, counts, draw) -> Simulated:
@@ -133,8 +133,8 @@ def test_the_share_of_the_seeds_is_covered(distribution):
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 def test_the_share_of_the_seeds_is_covered_at_each_size(distribution, counts):
     rng = np.random.default_rng(3)
-    found = coverage(lambda: share_of_variances(rng, counts, DISTRIBUTIONS[distribution]), 1500)
-    check("share of the seeds", found, 1500)
+    found = coverage(lambda: share_of_variances(rng, counts, DISTRIBUTIONS[distribution]), 1000)
+    check("share of the seeds", found, 1000)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (1, 3), (2, 8), (3, 8), (5, 2), (5, 3)])
