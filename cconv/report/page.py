@@ -21,7 +21,7 @@ from cconv.report.plots import (
     rung_audit_chart,
     strategies_chart,
 )
-from cconv.report.tables import curves_table, finalists_table, trials_table
+from cconv.report.tables import MEAN_PREDICTOR, curves_table, finalists_table, trials_table
 from cconv.report.verdicts import verdict_matrix
 from cconv.study.records import RunFolder
 
@@ -74,8 +74,16 @@ def _search_parts(run: RunFolder, summary: Mapping | None) -> dict:
     return {
         "curves_chart": _picture(learning_curves_chart(curves, **mean)) if searched else None,
         "search_chart": _picture(best_so_far_chart(trials, **mean)) if searched else None,
-        "trials": "" if trials.empty else _html(trials.sort_values("valid_normalized_mse")),
+        "trials": "" if trials.empty else _html(_with_mean_predictor(trials, **mean)),
     }
+
+
+def _with_mean_predictor(trials: pd.DataFrame, mean_predictor: float | None) -> pd.DataFrame:
+    """Trials by error, with a row of the mean predictor in its place, where it is known."""
+    table = trials.astype(object)  # a row with gaps would turn whole numbers into fractions
+    if mean_predictor is not None:
+        table.loc[len(table), ["trial", "valid_normalized_mse"]] = [MEAN_PREDICTOR, mean_predictor]
+    return table.sort_values("valid_normalized_mse")
 
 
 def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
