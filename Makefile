@@ -24,7 +24,8 @@ check: $(VENV)/.installed
 data: $(DATA)/metadata.json
 
 $(DATA)/metadata.json: $(VENV)/.installed
-	$(VENV)/bin/cconv data generate dam_break_2d --size small --out $(DATA) --overwrite
+	$(VENV)/bin/cconv data generate dam_break_2d --size small --trajectories 20 --frames 13 \
+		--steps-per-frame 210 --out $(DATA) --overwrite
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)

@@ -18,7 +18,7 @@ def whole_summary(summary: dict) -> dict:
             {"ms_per_frame": 3.6, "median": 2.3e-3, "low": 2.0e-3, "high": 2.8e-3},
             {"ms_per_frame": 4.2, "median": 9.5e-4, "low": 8.0e-4, "high": 1.2e-3},
         ],
-        "hypervolume": {"value": 7.52, "low": 7.21, "high": 7.93, "reference": [10.0, 1.0]},
+        "hypervolume": {"value": 7.52, "ci95": [7.21, 7.93], "why_no_interval": "", "reference": [10.0, 1.58]},
     }
     whole["growth"] = {
         "sizes": [1000, 100_000],
@@ -53,12 +53,15 @@ def whole_summary(summary: dict) -> dict:
             {"left_out": "density", "valid_normalized_mse": None, "of": 0.001, "flops_per_particle": None},
         ],
     }
+    whole["mean_predictor"] = {"valid": 4.5, "test": 1.58}
     whole["selection"] = {
-        "rule": "the cheapest within the margin",
-        "margin": 2e-4,
+        "units": 5,
+        "margin": 0.05,
         "best": ids[0],
+        "tied": ids[:2],
         "by_rule": {"one_standard_error": ids[0], "accurate_enough": None},
         "comparisons": [_comparison(name, number) for number, name in enumerate(ids)],
+        "retrained": {"normalized_mse": 0.0321, "choices": {ids[0]: 4, ids[1]: 1}},
     }
     whole["refined"] = {"layers": "narrowed to 1 and 2: no better trial has more"}
     for entry in whole["finalists"]:
@@ -160,9 +163,11 @@ def _comparison(name: str, number: int) -> dict:
     worse = number > 0
     return {
         "id": name,
-        "difference": 1e-3 * number,
-        "ci95": [8e-4 * number, 1.2e-3 * number],
-        "standard_error": 1e-4 * number,
+        "error": 1e-3 * (number + 1),
+        "ms_per_frame": 2.0 + number,
+        "ratio": 1.0 + number,
+        "ci95": [0.8 + number, 1.3 + number] if worse else [1.0, 1.0],
+        "log_standard_error": 0.12 * number,
         "within_one_se": not worse,
         "non_inferior": not worse,
         "accurate_enough": None,

@@ -197,13 +197,14 @@ def _finalists_table(summary: dict) -> Table:
     for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
         test, cost = entry["test"], entry["cost"]
         mark = " *" if entry["id"] == summary["recommended"]["id"] else ""
-        low, high = test["ci95"]
         table.add_row(
             entry["id"] + mark,
             f"{test['normalized_mse']:.4g}",
-            f"{low:.3g}–{high:.3g}",
+            "none" if test["ci95"] is None else "{:.3g}–{:.3g}".format(*test["ci95"]),
             f"{cost['ms_per_frame']:.2f}",
             f"{entry['num_parameters']:,}",
             "yes" if entry["stability"]["stable"] else "no",
         )
+    table.add_row("predicting the mean", f"{summary['mean_predictor']['test']:.4g}")
+    table.add_row("analytic SPH", "0", "", f"{summary['analytic']['ms_per_frame']:.2f}")
     return table

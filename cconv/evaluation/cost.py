@@ -15,13 +15,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from scipy.stats import binom
 
 from cconv.data.features import Inputs, inputs_without_density
 from cconv.data.targets import VECTOR_TASKS
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
-from cconv.errors import ConfigError
 from cconv.evaluation.cost_model import Surroundings, estimate
 from cconv.neighbors import radius_graph
 from cconv.sph.compiled import CompiledSums
@@ -29,7 +27,6 @@ from cconv.sph.kernels import AbstractKernel, kernel_named
 from cconv.training.field_model import FieldConfig, FieldModel
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
-RESOLUTION = 0.02  # relative difference of two times that is too small to choose a model by
 
 # Times of the geometry and of the rest of one prediction, s, given the number of the turn.
 Call = Callable[[int], tuple[float, float]]
@@ -137,33 +134,6 @@ def measure_costs(
             num_particles=particles,
         )
     return costs, AnalyticCost(**_medians(times[ANALYTIC]), turns_ms=_turns(times[ANALYTIC]))
-
-
-def times_tie(ours: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether the times of two models, measured in turn, do not differ beyond their noise.
-
-    A sign test on paired turns: the 95 % interval of the median ratio of the two times in a turn, from order statistics
-    by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must reach 1, or come
-    closer to it than is worth a choice (`RESOLUTION`). Fewer than six turns tell nothing apart.
-
-    Args:
-        ours: Time of each turn, such as `Cost.turns_ms`.
-        other: Times of the other model in the same turns.
-
-    Raises:
-        ConfigError: If the turns are not as many.
-    """
-    if len(ours) != len(other):
-        raise ConfigError(
-            f"`ours` and `other` must be times of the same turns, got {len(ours)} and {len(other)}; "
-            "measure both in one run."
-        )
-    ratios = sorted(first / second for first, second in zip(ours, other, strict=True))
-    below = int(binom.ppf(0.025, len(ratios), 0.5))  # the largest number with P(fewer) <= 0.025
-    if below == 0:
-        return True
-    low, high = ratios[below - 1], ratios[-below]
-    return low <= 1 + RESOLUTION and high >= 1 / (1 + RESOLUTION)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,14 @@
-"""Errors of a model on samples, and their intervals."""
+"""Errors of a model on samples, and those of the trivial model that always predicts the mean."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 import torch
+from torch import Tensor
 
+from cconv.data.features import standardize_vectors
 from cconv.data.targets import Sample
-from cconv.evaluation.statistics import crossed_standard_error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,18 +44,39 @@ def frame_errors(model, samples: Iterable[Sample], geometry: Callable | None = N
     errors = []
     for sample in samples:
         target = model.standardize_target(sample.target)
-        squared = (model(sample.inputs, geometry(sample)) - target).double().square().mean().item()
-        own_variance = target.double().var(dim=0, correction=0).mean().item()
-        errors.append(
-            FrameError(
-                trajectory=sample.trajectory,
-                frame=sample.frame,
-                num_particles=len(target),
-                normalized_mse=squared,
-                per_frame_normalized_mse=squared / own_variance if own_variance > 0 else None,
-            )
-        )
+        errors.append(_frame_error(sample, model(sample.inputs, geometry(sample)), target))
     return errors
+
+
+def mean_predictor_error(samples: Iterable[Sample], train_samples: Iterable[Sample]) -> list[FrameError]:
+    """Errors, on each frame, of predicting the mean of the training split everywhere.
+
+    By definition `normalized_mse` of them is 1 on the training split. On another split it is what a model must be below
+    to know anything: more than 1 where that split moves more than the training split, less where it is calmer.
+
+    Args:
+        samples: Frames of a split.
+        train_samples: Frames of the training split.
+    """
+    training = standardize_vectors(sample.target for sample in train_samples)
+    errors = []
+    for sample in samples:
+        target = (sample.target.double() - training.mean) / training.scale
+        errors.append(_frame_error(sample, torch.zeros_like(target), target))
+    return errors
+
+
+def _frame_error(sample: Sample, prediction: Tensor, target: Tensor) -> FrameError:
+    """Error of a standardised prediction of a standardised target, both (N, C)."""
+    squared = (prediction - target).double().square().mean().item()
+    own_variance = target.double().var(dim=0, correction=0).mean().item()
+    return FrameError(
+        trajectory=sample.trajectory,
+        frame=sample.frame,
+        num_particles=len(target),
+        normalized_mse=squared,
+        per_frame_normalized_mse=squared / own_variance if own_variance > 0 else None,
+    )
 
 
 def normalized_mse(errors: Sequence[FrameError]) -> float:
@@ -92,25 +113,3 @@ def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.
         blocks = np.array_split(np.arange(len(errors)), max(1, round(len(errors) / frames_per_block)))
         groups = [[errors[index] for index in block] for block in blocks]
     return np.array([normalized_mse(group) for group in groups])
-
-
-def crossed_interval(values: np.ndarray, mean: float, confidence: float = 0.95) -> tuple[float, float]:
-    r"""Interval of a mean error over seeds and units, both seen as draws of many.
-
-    From the standard error and degrees of freedom of `crossed_standard_error`. Two or three seeds are too few to
-    resample; the t-distribution says so by a wide interval. It is symmetric on a log scale, as errors are positive.
-    With a single unit it covers the seeds alone.
-
-    Args:
-        values: Errors (seeds, units), at least two seeds.
-        mean: The reported mean error, at the centre.
-        confidence: Share of such intervals that hold the true mean.
-
-    Returns:
-        Lower and upper end.
-    """
-    error, freedom = crossed_standard_error(values)
-    if error == 0 or mean <= 0:
-        return mean, mean
-    width = scipy.stats.t.ppf((1 + confidence) / 2, freedom) * error / mean
-    return float(mean * np.exp(-width)), float(mean * np.exp(width))

@@ -1,94 +1,130 @@
-r"""Paired differences of the errors of two models on the same seeds and units, with intervals and p-values.
+r"""Intervals of errors that were measured on several seeds and units: of a mean error, and of the ratio of two models.
 
-A unit is what an interval resamples beside seeds: a test trajectory, or a block of frames. Seeds and units are crossed,
-so cells :math:`d_{su}` of one row or column are not independent draws. Rows and columns are resampled independently
-(Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1 (2007)), which is slightly conservative.
+A unit is what varies beside seeds: a trajectory, or a block of frames. Seeds and units are crossed, so the cells of one
+row or column are not independent draws. Errors are positive and span decades; the intervals hold for logarithms that
+are normal, with an effect of the seed, one of the unit, and one of both. tests/evaluation/test_coverage.py simulates
+how often each of them holds the true value.
 """
 
 import math
-import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
-from cconv.errors import DataError, ShapeError
+from cconv.errors import ConfigError, DataError, ShapeError
 
-CELLS_AT_ONCE = 2_000_000  # resampled errors held in memory
+RESOLUTION = 0.05  # relative difference of two times that is too small to choose a model by
+
+FEWEST = 4  # seeds or units from which an interval is given
+SMALLEST_ERROR = 1e-14  # of the variance: the square of what float32 resolves; what lies below counts as that
+_DRAWS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairedDifference:
-    """How much larger the errors of one model are than those of a reference.
+class PairedRatio:
+    """How many times as large the errors of one model are as those of a reference, seed by seed and unit by unit.
 
     Attributes:
-        difference: Mean of error minus reference error; the margins of selection are set on it.
-        standard_error: Its standard error over seeds and units; 0 where only one number is known.
-        ci95: Its BCa bootstrap interval.
-        ratio: Mean error / mean reference error, for words; None where a reference error is 0.
-        ratio_ci95: Its BCa bootstrap interval, or None.
-        p_over_seeds: Sign-flip p-value of "the difference is 0 over retrainings, on these units"; None for one seed.
-        p_over_units: The same for "over other units, with these trainings"; None for one unit.
-        seeds: Number of seeds A.
-        units: Number of units B.
+        ratio: Geometric mean of the ratios of errors.
+        log_ratio: Its natural logarithm.
+        log_standard_error: Standard error of `log_ratio` over seeds and units; 0 where only one number is known.
+        ci95: 95 % interval of `ratio` over other seeds and units; None where `why_no_interval` has a reason.
     """
 
-    difference: float
-    standard_error: float
-    ci95: tuple[float, float]
-    ratio: float | None
-    ratio_ci95: tuple[float, float] | None
-    p_over_seeds: float | None
-    p_over_units: float | None
-    seeds: int
-    units: int
+    ratio: float
+    log_ratio: float
+    log_standard_error: float
+    ci95: tuple[float, float] | None
 
 
-def paired_difference(
-    ours: np.ndarray, reference: np.ndarray, *, resamples: int = 4999, seed: int = 0
-) -> PairedDifference:
-    r"""Compare the errors of a model with those of a reference, paired by seed and unit.
+def why_no_interval(seeds: int, units: int) -> str:
+    """The reason why no 95 % interval covers what it says with so few draws, or "".
 
-    The interval is BCa (Efron, "Better bootstrap confidence intervals", JASA 82 (1987)), expanded for few draws. Errors
-    span decades, and the ratio is that of means, so that it lies above 1 exactly where the difference is positive.
+    With fewer than `FEWEST` units, or two or three seeds, the simulated intervals of every kind that was tried cover 48
+    to 93 %, or reach over many decades. A single seed is no draw: the interval then is that of this one fit.
 
-    A difference is beyond chance only if both p-values are small. A test by sign flips of n values gives no p below
-    :math:`2^{1-n}`: 0.0625 for five seeds.
+    Args:
+        seeds: Number of seeds; 1 for a closed form.
+        units: Number of units.
+    """
+    needed = f"too little of others; at least {FEWEST} are needed"
+    if units < FEWEST:
+        return f"1 unit says {needed}" if units == 1 else f"{units} units say {needed}"
+    if 1 < seeds < FEWEST:
+        return f"{seeds} seeds say {needed}"
+    return ""
+
+
+def crossed_interval(errors: np.ndarray, *, seed: int = 0) -> tuple[float, float] | None:
+    r"""95 % interval of a model's mean error over all seeds and units that could have been drawn.
+
+    It is a generalised confidence interval: the effects of seed a, unit b and both c of the logarithms are normal, the
+    mean is :math:`\exp(\mu + (\sigma_a^2 + \sigma_b^2 + \sigma_c^2) / 2)`, and the unknown variances are what the sums
+    of squares of the table leave possible, :math:`SS / \chi^2`. The upper end of few units is far up: they do not rule
+    out that others are much harder. Sources: Weerahandi, "Generalized Confidence Intervals", JASA 88 (1993);
+    Krishnamoorthy and Mathew, "Inferences on the means of lognormal distributions using generalized p-values and
+    generalized confidence intervals", J. Statistical Planning and Inference 115 (2003).
+
+    Args:
+        errors: Errors (seeds, units), positive; one row where no seed is drawn.
+        seed: Seed of the draws.
+
+    Returns:
+        Lower and upper end; None where `why_no_interval` has a reason.
+
+    Raises:
+        ShapeError: If `errors` is no table.
+        DataError: If an error is negative or not finite.
+    """
+    logarithms = _logarithms(errors)
+    seeds, units = logarithms.shape
+    if why_no_interval(seeds, units):
+        return None
+    rng = np.random.default_rng(seed)
+    rows, columns, both = _sums_of_squares(logarithms)
+    of_both = both / rng.chisquare(max((seeds - 1) * (units - 1), 1), _DRAWS)
+    of_seeds = np.maximum(rows / rng.chisquare(max(seeds - 1, 1), _DRAWS) - of_both, 0) / units
+    of_units = np.maximum(columns / rng.chisquare(units - 1, _DRAWS) - of_both, 0) / seeds
+    spread = np.sqrt(of_seeds / seeds + of_units / units + of_both / (seeds * units))
+    means = logarithms.mean() + rng.standard_normal(_DRAWS) * spread + (of_seeds + of_units + of_both) / 2
+    low, high = np.exp(np.minimum(np.quantile(means, (0.025, 0.975)), math.log(1e300)))
+    return float(low), float(high)
+
+
+def paired_ratio(ours: np.ndarray, reference: np.ndarray) -> PairedRatio:
+    """Compare the errors of a model with those of a reference on the same seeds and units.
+
+    What a unit does to both models alike drops out of the ratio. The interval is that of Student's t on the logarithms,
+    with the standard error and degrees of freedom of `crossed_standard_error`.
 
     Args:
         ours: Errors (seeds, units); one row, which counts for every seed, where no seed is drawn.
         reference: Errors of the reference, likewise, with the same units.
-        resamples: Bootstrap resamples.
-        seed: Seed of the resampling.
 
     Raises:
         ShapeError: If the two cannot be paired.
         DataError: If an error is negative or not finite.
     """
-    ours, reference = _paired(ours, reference)
+    ours, reference = paired_logarithms([ours, reference])
     differences = ours - reference
-    positive = reference.min() > 0
-    error, freedom = crossed_standard_error(differences)
-    confidence = expanded_confidence(freedom)
-
-    def interval(statistic: Callable) -> tuple[float, float]:
-        return crossed_bca_interval(statistic, differences.shape, resamples=resamples, seed=seed, confidence=confidence)
-
-    def ratio(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        return ours[rows, columns].mean((-2, -1)) / reference[rows, columns].mean((-2, -1))
-
-    return PairedDifference(
-        difference=float(differences.mean()),
-        standard_error=error,
-        ci95=interval(lambda rows, columns: differences[rows, columns].mean((-2, -1))),
-        ratio=float(ours.mean() / reference.mean()) if positive else None,
-        ratio_ci95=interval(ratio) if positive else None,
-        p_over_seeds=_sign_flip_p_value(differences.mean(axis=1), seed),
-        p_over_units=_sign_flip_p_value(differences.mean(axis=0), seed),
-        seeds=differences.shape[0],
-        units=differences.shape[1],
+    interval = mean_interval(differences)
+    return PairedRatio(
+        ratio=math.exp(differences.mean()),
+        log_ratio=float(differences.mean()),
+        log_standard_error=crossed_standard_error(differences)[0],
+        ci95=None if interval is None else (math.exp(interval[0]), math.exp(interval[1])),
     )
+
+
+def mean_interval(values: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of the mean of a table (seeds, units) of normal values, by Student's t; None for too few draws."""
+    if why_no_interval(*values.shape):
+        return None
+    error, freedom = crossed_standard_error(values)
+    width = scipy.special.stdtrit(freedom, 0.975) * error if error else 0.0
+    return float(values.mean() - width), float(values.mean() + width)
 
 
 def crossed_standard_error(values: np.ndarray) -> tuple[float, float]:
@@ -112,97 +148,62 @@ def crossed_standard_error(values: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(variance)), float(freedom)
 
 
-def expanded_confidence(freedom: float, confidence: float = 0.95) -> float:
-    r"""Nominal confidence by which a bootstrap interval of few draws covers `confidence`.
+def paired_logarithms(tables: list[np.ndarray]) -> list[np.ndarray]:
+    """Natural logarithms of tables of errors (seeds, units), those of one row repeated to the seeds of the others.
 
-    The bootstrap knows neither the t-distribution nor that it resamples :math:`\nu + 1` draws with a variance too small
-    by :math:`\nu / (\nu + 1)`. In simulated tables of five seeds and six or more units, 95 % intervals cover 81 to 93 %
-    without this and 90 to 97 % with it; three seeds or units remain too few. Source: the expanded percentile interval
-    of Hesterberg, "What Teachers Should Know About the Bootstrap", The American Statistician 69 (2015).
-
-    Args:
-        freedom: Degrees of freedom :math:`\nu` of the standard error.
-        confidence: Wanted share of intervals that hold the true value.
+    Raises:
+        ShapeError: If they differ in their units or seeds.
+        DataError: If an error is negative or not finite.
     """
-    if math.isinf(freedom):
-        return confidence
-    quantile = scipy.stats.t.ppf((1 + confidence) / 2, freedom) * math.sqrt((freedom + 1) / freedom)
-    return float(1 - 2 * scipy.stats.norm.sf(quantile))
-
-
-def crossed_bca_interval(
-    statistic: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    shape: tuple[int, int],
-    *,
-    resamples: int = 4999,
-    seed: int = 0,
-    confidence: float = 0.95,
-) -> tuple[float, float]:
-    """BCa interval of a statistic of a table whose rows and columns are both draws of many.
-
-    An axis of length one is not resampled. Where BCa has no answer, as for a jackknife without spread, the interval is
-    that of percentiles; where nothing varies, it is the value itself.
-
-    Args:
-        statistic: Value from indices of rows (..., A, 1) and columns (..., 1, B), as a table is indexed with.
-        shape: (A, B).
-        resamples: Bootstrap resamples.
-        seed: Seed of the resampling.
-        confidence: Nominal share of such intervals that hold the true value, see `expanded_confidence`.
-    """
-    drawn = [axis for axis, count in enumerate(shape) if count > 1]
-
-    def of_draws(*draws: np.ndarray, axis: int = -1) -> np.ndarray:
-        indices = [np.zeros((1,), dtype=int)] * 2
-        for place, draw in zip(drawn, draws, strict=True):
-            indices[place] = draw
-        return statistic(indices[0][..., :, None], indices[1][..., None, :])
-
-    everything = [np.arange(shape[axis]) for axis in drawn]
-    value = float(of_draws(*everything))
-    if not drawn:
-        return value, value
-    settings = {
-        "vectorized": True,
-        "confidence_level": confidence,
-        "batch": max(1, CELLS_AT_ONCE // math.prod(shape)),
-    }
-    rng = np.random.default_rng(seed)
-    draws = scipy.stats.bootstrap(everything, of_draws, n_resamples=resamples, method="percentile", rng=rng, **settings)
-    if np.ptp(draws.bootstrap_distribution) <= 1e-12 * abs(value):
-        return value, value
-    without_answer = warnings.catch_warnings(action="ignore", category=scipy.stats.DegenerateDataWarning)
-    with without_answer, np.errstate(divide="ignore", invalid="ignore"):
-        bca = scipy.stats.bootstrap(
-            everything, of_draws, n_resamples=0, bootstrap_result=draws, method="BCa", **settings
-        )
-    ends = bca.confidence_interval
-    low, high = ends if np.isfinite(ends).all() else draws.confidence_interval
-    return float(low), float(high)
-
-
-def _sign_flip_p_value(values: np.ndarray, seed: int) -> float | None:
-    if len(values) < 2:
-        return None
-    if np.ptp(values) == 0 and values[0] == 0:
-        return 1.0
-    test = scipy.stats.permutation_test(
-        (values,), np.mean, permutation_type="samples", vectorized=True, rng=np.random.default_rng(seed)
-    )
-    return float(test.pvalue)
-
-
-def _paired(ours: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    arrays = np.asarray(ours, dtype=float), np.asarray(reference, dtype=float)
-    if any(array.ndim != 2 or array.size == 0 for array in arrays):
-        raise ShapeError(f"errors must have shape (seeds, units), got {arrays[0].shape} and {arrays[1].shape}.")
-    rows = {len(array) for array in arrays} - {1}
-    if len(rows) > 1 or arrays[0].shape[1] != arrays[1].shape[1]:
+    logarithms = [_logarithms(table) for table in tables]
+    shapes = [table.shape for table in logarithms]
+    if len({rows for rows, _ in shapes} - {1}) > 1 or len({units for _, units in shapes}) > 1:
         raise ShapeError(
-            f"errors of shape {arrays[0].shape} and {arrays[1].shape} cannot be paired: give both the same seeds "
-            "(or one row, for a model without seeds) and the same units."
+            f"errors of shapes {', '.join(map(str, shapes))} cannot be paired: give all the same seeds (or one row, "
+            "for a model without seeds) and the same units."
         )
-    if any(not np.isfinite(array).all() or array.min() < 0 for array in arrays):
+    return list(np.broadcast_arrays(*logarithms))
+
+
+def _logarithms(errors: np.ndarray) -> np.ndarray:
+    errors = np.asarray(errors, dtype=float)
+    if errors.ndim != 2 or errors.size == 0:
+        raise ShapeError(f"errors must have shape (seeds, units), got {errors.shape}.")
+    if not np.isfinite(errors).all() or errors.min() < 0:
         raise DataError("errors must be finite and not negative; leave models with a diverged seed out.")
-    ours, reference = np.broadcast_arrays(*arrays)
-    return ours, reference
+    return np.log(np.maximum(errors, SMALLEST_ERROR))
+
+
+def _sums_of_squares(table: np.ndarray) -> tuple[float, float, float]:
+    """Sums of squares of rows, columns and what is left, of a two-way table without replication."""
+    rows, columns = table.mean(axis=1, keepdims=True), table.mean(axis=0, keepdims=True)
+    left = table - rows - columns + table.mean()
+    seeds, units = table.shape
+    return units * float(rows.var()) * seeds, seeds * float(columns.var()) * units, float((left**2).sum())
+
+
+def times_tie(ours: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether the times of two models, measured in turn, do not differ beyond their noise.
+
+    A sign test on paired turns: the 95 % interval of the median ratio of the two times in a turn, from order statistics
+    by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must reach 1, or come
+    closer to it than is worth a choice (`RESOLUTION`). Fewer than six turns tell nothing apart.
+
+    Args:
+        ours: Time of each turn, such as `Cost.turns_ms`.
+        other: Times of the other model in the same turns.
+
+    Raises:
+        ConfigError: If the turns are not as many.
+    """
+    if len(ours) != len(other):
+        raise ConfigError(
+            f"`ours` and `other` must be times of the same turns, got {len(ours)} and {len(other)}; "
+            "measure both in one run."
+        )
+    ratios = sorted(first / second for first, second in zip(ours, other, strict=True))
+    below = int(scipy.stats.binom.ppf(0.025, len(ratios), 0.5))  # the largest number with P(fewer) <= 0.025
+    if below == 0:
+        return True
+    low, high = ratios[below - 1], ratios[-below]
+    return low <= 1 + RESOLUTION and high >= 1 / (1 + RESOLUTION)

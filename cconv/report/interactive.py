@@ -7,9 +7,9 @@ import pandas as pd
 import plotly.graph_objects as go
 import plotly.io
 
-from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
+from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, stage_colors
 from cconv.report.speed_accuracy import error_range
-from cconv.report.tables import speed_accuracy_table
+from cconv.report.tables import MEAN_PREDICTOR, speed_accuracy_table
 
 _SYMBOLS = {"recommended": "star", "baseline": "square", "thesis's best": "diamond", "finalist": "circle"}
 
@@ -21,13 +21,15 @@ def interactive_chart(summary: Mapping) -> go.Figure:
     """
     points = speed_accuracy_table(summary)
     search, finalists, analytic = (points[points["kind"] == kind] for kind in ("search", "finalist", "analytic"))
-    low, high = error_range(points)
+    trivial = summary["mean_predictor"]["test"]
+    low, high = error_range(points, trivial)
     figure = go.Figure()
     colors = stage_colors(list(search["group"].unique()))
     for stage, trials in search.groupby("group", sort=False):
         figure.add_trace(_search_trace(stage, trials, colors[stage]))
     figure.add_traces(_attainment_traces(summary))
     figure.add_trace(_front_trace(finalists))
+    figure.add_trace(_mean_predictor_trace(trivial, points["ms"].min(), points["ms"].max()))
     for group in _SYMBOLS:
         members = finalists[finalists["group"] == group]
         if not members.empty:
@@ -74,16 +76,24 @@ def _attainment_traces(summary: Mapping) -> list[go.Scatter]:
     return [
         go.Scatter(y=table["low"], line=edge, showlegend=False, **style),
         go.Scatter(y=table["high"], line=edge, fill="tonexty", fillcolor="rgba(120,120,120,0.18)",
-                   name="front over seeds, 95 %", **style),
+                   name="front, 8 of 10 draws of a seed each", **style),
         go.Scatter(y=table["median"], line={"color": "#999", "dash": "dot", "shape": "hv"},
-                   name="front over seeds, median", **style | {"legendgroup": None}),
+                   name="front, median of these draws", **style | {"legendgroup": None}),
     ]  # fmt: skip
 
 
 def _front_trace(finalists: pd.DataFrame) -> go.Scatter:
     front = finalists[finalists["on_front"]].sort_values("ms")
     line = {"color": "#555", "width": 1.5, "shape": "hv"}
-    return go.Scatter(x=front["ms"], y=front["error"], mode="lines", line=line, name="front", hoverinfo="skip")
+    return go.Scatter(
+        x=front["ms"], y=front["error"], mode="lines", line=line, name="front by validation", hoverinfo="skip"
+    )
+
+
+def _mean_predictor_trace(error: float, low: float, high: float) -> go.Scatter:
+    line = {"color": MEAN_COLOR, "width": 1.5, "dash": "dash"}
+    name = f"{MEAN_PREDICTOR}: {error:.3g}"
+    return go.Scatter(x=[low, high], y=[error, error], mode="lines", line=line, name=name, hoverinfo="skip")
 
 
 def _finalists_trace(group: str, members: pd.DataFrame) -> go.Scatter:
@@ -125,7 +135,7 @@ def _hover(points: pd.DataFrame) -> dict:
 def _description(row) -> str:
     tested = row.kind == "finalist"
     error = f"{'test' if tested else 'validation'} error {row.error:.4g}"
-    if tested:
+    if tested and not math.isnan(row.error_low):
         error += f" (95 %: {row.error_low:.3g} to {row.error_high:.3g})"
     lines = [
         f"<b>{row.name}</b> – {row.group}{'' if row.outcome == 'completed' else f', {row.outcome}'}",

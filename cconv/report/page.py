@@ -22,7 +22,7 @@ from cconv.report.plots import (
     rung_audit_chart,
     strategies_chart,
 )
-from cconv.report.tables import curves_table, finalists_table, trials_table
+from cconv.report.tables import MEAN_PREDICTOR, curves_table, finalists_table, trials_table
 from cconv.report.verdicts import verdict_matrix
 from cconv.study.records import RunFolder
 
@@ -62,20 +62,29 @@ def render_report(run: RunFolder) -> str:
         state=run.read("state.json"),
         environment=_read_if_there(run, "environment.json"),
         summary=summary,
-        **_search_parts(run),
+        **_search_parts(run, summary),
         **(_finished_parts(run, summary) if summary else {}),
     )
 
 
-def _search_parts(run: RunFolder) -> dict:
-    """What the trials show, also of a run that is not finished."""
+def _search_parts(run: RunFolder, summary: Mapping | None) -> dict:
+    """What the trials show, also of a run that is not finished, for which the mean predictor is not known yet."""
+    mean = {"mean_predictor": summary["mean_predictor"]["valid"] if summary else None}
     trials, curves = trials_table(run), curves_table(run)
     searched = not trials.empty and bool(trials["valid_normalized_mse"].notna().any())
     return {
-        "curves_chart": _picture(learning_curves_chart(curves)) if searched else None,
-        "search_chart": _picture(best_so_far_chart(trials)) if searched else None,
-        "trials": "" if trials.empty else _html(trials.sort_values("valid_normalized_mse")),
+        "curves_chart": _picture(learning_curves_chart(curves, **mean)) if searched else None,
+        "search_chart": _picture(best_so_far_chart(trials, **mean)) if searched else None,
+        "trials": "" if trials.empty else _html(_with_mean_predictor(trials, **mean)),
     }
+
+
+def _with_mean_predictor(trials: pd.DataFrame, mean_predictor: float | None) -> pd.DataFrame:
+    """Trials by error, with a row of the mean predictor in its place, where it is known."""
+    table = trials.astype(object)  # a row with gaps would turn whole numbers into fractions
+    if mean_predictor is not None:
+        table.loc[len(table), ["trial", "valid_normalized_mse"]] = [MEAN_PREDICTOR, mean_predictor]
+    return table.sort_values("valid_normalized_mse")
 
 
 def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
@@ -114,11 +123,14 @@ def _comparison(summary: Mapping) -> dict:
 
 
 def _finalists_rows(summary: Mapping) -> list[dict]:
-    """Rows of the tables of finalists, most accurate first; each with its whole entry in the summary."""
+    """Rows of the tables of finalists, most accurate first; each with its whole entry in the summary.
+
+    The rows of the mean predictor and of analytic SPH are among them, without an entry.
+    """
     front = set(summary["pareto_front"])
     entries = {entry["id"]: entry for entry in summary["finalists"]}
     rows = finalists_table(summary).to_dict("records")
-    return [row | {"on_front": row["model"] in front, "entry": entries[row["model"]]} for row in rows]
+    return [row | {"on_front": row["model"] in front, "entry": entries.get(row["model"])} for row in rows]
 
 
 def _explained(run: RunFolder, summary: Mapping) -> dict | None:

@@ -1,22 +1,30 @@
 """Charts of a study. Each function returns a matplotlib figure of its own; showing or saving it is the caller's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import pandas as pd
 import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cconv.report.colors import MARKED, stage_colors
-from cconv.report.tables import AUDIT_MEASURES, growth_table, rung_audit_table, strategies_table
+from cconv.report.colors import MARKED, MEAN_COLOR, stage_colors
+from cconv.report.tables import AUDIT_MEASURES, MEAN_PREDICTOR, growth_table, rung_audit_table, strategies_table
 from cconv.report.verdicts import verdict_matrix
 
 _ERROR = "validation error (normalized MSE)"
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
 
 
-def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> Figure:
-    """Validation error against gradient updates, one line a search trial, and one for each retraining beside them."""
+def learning_curves_chart(
+    curves: pd.DataFrame, baseline: str = "baseline", mean_predictor: float | None = None
+) -> Figure:
+    """Validation error against gradient updates, one line a search trial, and one for each retraining beside them.
+
+    Args:
+        curves: `curves_table` of a run.
+        baseline: Name of the baseline.
+        mean_predictor: Validation error of predicting the mean, drawn as a line; None where it is not known yet.
+    """
     figure, (search, finals) = new_figure(11, 4.2, columns=2)
     trials, retrained = curves[~curves["retrained"]], curves[curves["stage"] == "finalists"]
     stages = stage_colors(list(trials["stage"].unique()))
@@ -34,6 +42,7 @@ def learning_curves_chart(curves: pd.DataFrame, baseline: str = "baseline") -> F
             finals.plot(curve["updates"], curve["valid_normalized_mse"], marker="." if len(curve) == 1 else "", **style)
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
         axes.set(yscale="log", xlabel="gradient updates", ylabel=_ERROR, title=title)
+        mark_mean_predictor(axes.axhline, mean_predictor)
         _legend(axes)
     return figure
 
@@ -63,8 +72,13 @@ def budget_chart(curves: pd.DataFrame, finalists: Sequence[str]) -> Figure:
     return figure
 
 
-def best_so_far_chart(trials: pd.DataFrame) -> Figure:
-    """Smallest validation error found against trials begun, and each trial's error by outcome."""
+def best_so_far_chart(trials: pd.DataFrame, mean_predictor: float | None = None) -> Figure:
+    """Smallest validation error found against trials begun, and each trial's error by outcome.
+
+    Args:
+        trials: `trials_table` of a run.
+        mean_predictor: Validation error of predicting the mean, drawn as a line; None where it is not known yet.
+    """
     figure, axes = new_figure(7.5, 4)
     order = range(1, len(trials) + 1)
     sns.scatterplot(
@@ -73,6 +87,7 @@ def best_so_far_chart(trials: pd.DataFrame) -> Figure:
     complete = trials["valid_normalized_mse"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
     axes.set(yscale="log", xlabel="trial", ylabel="last validation error (normalized MSE)", title="search")
+    mark_mean_predictor(axes.axhline, mean_predictor)
     _legend(axes, **_BESIDE)
     return figure
 
@@ -83,6 +98,7 @@ def strategies_chart(summary: Mapping) -> Figure:
     for name, curve in strategies_table(summary).groupby("strategy", sort=False):
         axes.step(curve["updates"], curve["error"], where="post", marker=".", label=name)
     axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_ERROR, title="best so far, by strategy")
+    mark_mean_predictor(axes.axhline, summary["mean_predictor"]["valid"])
     _legend(axes, **_BESIDE)
     return figure
 
@@ -161,7 +177,20 @@ def ablation_chart(summary: Mapping) -> Figure:
     axes.set_yticks(places, [str(change) for change in path["change"]])
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel=_ERROR, title="from the baseline to the best")
+    mark_mean_predictor(axes.axvline, summary["mean_predictor"]["valid"])
+    _legend(axes)
     return figure
+
+
+def mark_mean_predictor(draw_line: Callable, error: float | None) -> None:
+    """Draw what a model must be below to know anything: the error of predicting the mean on the split of the chart.
+
+    Args:
+        draw_line: `axhline` or `axvline` of the axes.
+        error: That error; None draws nothing.
+    """
+    if error is not None:
+        draw_line(error, color=MEAN_COLOR, lw=1.2, ls="--", label=f"{MEAN_PREDICTOR}: {error:.3g}")
 
 
 def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Axes]:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
+from cconv.report.plots import mark_mean_predictor
 from cconv.report.tables import ANALYTIC, speed_accuracy_table
 
 _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
@@ -21,9 +22,10 @@ _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D
 def speed_accuracy_chart(summary: Mapping) -> Figure:
     """Error against time per frame, log axes: finalists, search, front, analytic SPH.
 
-    Vertical bars are 95 % intervals over seeds and test units, horizontal bars the quartiles of the timing. Each
-    finalist is named in the margin, at the end of a thin line from its point. Trials of the search have validation
-    errors and mostly estimated times; those that were stopped are hollow.
+    Vertical bars are 95 % intervals over seeds and test units, where there are enough for one; horizontal bars are the
+    quartiles of the timing. The front was found by validation errors; the dashed line is predicting the mean on the
+    test split. Each finalist is named in the margin, at the end of a thin line from its point. Trials of the search
+    have validation errors and mostly estimated times; those that were stopped are hollow.
     """
     points = speed_accuracy_table(summary)
     finalists = points[points["kind"] == "finalist"].sort_values("error", ascending=False)
@@ -35,7 +37,9 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
     _draw_front(axes, summary, finalists)
     for row in finalists.itertuples():
         _draw_finalist(axes, row)
-    axes.set_ylim(*error_range(points))
+    trivial = summary["mean_predictor"]["test"]
+    axes.set_ylim(*error_range(points, trivial))
+    mark_mean_predictor(axes.axhline, trivial)
     _draw_analytic(axes, points[points["kind"] == "analytic"])
     _name_in_margin(axes, finalists)
     for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
@@ -46,13 +50,13 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
     return figure
 
 
-def error_range(points: pd.DataFrame) -> tuple[float, float]:
-    """Lower and upper end of the error axis: all finalists, and trials up to ten times the worst of them."""
+def error_range(points: pd.DataFrame, mean_predictor: float) -> tuple[float, float]:
+    """Lower and upper end of the error axis: all finalists, the mean predictor, trials up to ten times the worst."""
     finalists = points[points["kind"] == "finalist"]
     highest = finalists[["error", "error_high"]].max(axis=None)
     errors = points.loc[points["error"].between(0, 10 * highest, inclusive="neither"), "error"]
-    lowest = min(errors.min(), finalists["error_low"][finalists["error_low"] > 0].min())
-    return lowest / 3, 2 * max(errors.max(), highest)
+    lowest = np.nanmin([errors.min(), finalists["error_low"][finalists["error_low"] > 0].min()])
+    return lowest / 3, 2 * max(errors.max(), highest, mean_predictor)
 
 
 def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
@@ -69,20 +73,23 @@ def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
 
 def _draw_front(axes: Axes, summary: Mapping, finalists: pd.DataFrame) -> None:
     front = finalists[finalists["on_front"]].sort_values("ms")
-    axes.step(front["ms"], front["error"], where="post", color="0.35", lw=1.2, zorder=3, label="front")
+    axes.step(front["ms"], front["error"], where="post", color="0.35", lw=1.2, zorder=3, label="front by validation")
     attainment = pd.DataFrame(summary.get("front", {}).get("attainment", []))
     if not attainment.empty:
         ms, low, high = (attainment[name].astype(float) for name in ("ms_per_frame", "low", "high"))
-        axes.fill_between(ms, low, high, step="post", color="0.5", alpha=0.2, lw=0, label="front over seeds")
+        axes.fill_between(
+            ms, low, high, step="post", color="0.5", alpha=0.2, lw=0, label="front, 8 of 10 draws of a seed each"
+        )
 
 
 def _draw_finalist(axes: Axes, row) -> None:
     marker, size = _MARKERS[row.group]
+    has_interval = not np.isnan(row.error_low)
     axes.errorbar(
         row.ms,
         row.error,
         xerr=[[max(row.ms - row.ms_low, 0)], [max(row.ms_high - row.ms, 0)]],
-        yerr=[[max(row.error - row.error_low, 0)], [max(row.error_high - row.error, 0)]],
+        yerr=[[max(row.error - row.error_low, 0)], [max(row.error_high - row.error, 0)]] if has_interval else None,
         fmt=marker,
         markersize=size,
         color=MARKED[row.group],

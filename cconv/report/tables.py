@@ -1,5 +1,6 @@
 """A run folder as tidy tables. Reads our records only; neither Ray nor torch is imported."""
 
+import math
 from collections.abc import Mapping
 
 import pandas as pd
@@ -7,6 +8,7 @@ import pandas as pd
 from cconv.study.records import RunFolder
 
 ANALYTIC = "analytic SPH"
+MEAN_PREDICTOR = "predicting the mean"  # of the training split, always and everywhere
 AUDIT_MEASURES = {"spearman": "rank correlation", "recall": "recall of the best", "regret": "regret"}
 
 
@@ -50,13 +52,18 @@ def curves_table(run: RunFolder) -> pd.DataFrame:
 
 
 def finalists_table(summary: Mapping) -> pd.DataFrame:
-    """One row a finalist: test errors with interval, cost, parameters; most accurate first."""
-    rows = []
+    """One row a finalist: errors with the interval of the test error, cost, parameters; most accurate first.
+
+    Two rows say what the errors and times mean: predicting the mean of the training split, and analytic SPH. Intervals
+    are empty where there are too few seeds or units for one.
+    """
+    rows = _reference_rows(summary)
     for entry in summary["finalists"]:
-        low, high = entry["test"]["ci95"]
+        low, high = entry["test"]["ci95"] or (math.nan, math.nan)
         rows.append(
             {
                 "model": entry["id"],
+                "valid_normalized_mse": entry["valid"]["normalized_mse"],
                 "normalized_mse": entry["test"]["normalized_mse"],
                 "ci95_low": low,
                 "ci95_high": high,
@@ -82,8 +89,9 @@ def speed_accuracy_table(summary: Mapping) -> pd.DataFrame:
 
     Columns: name; kind ("finalist", "search" or "analytic"); group, the stage of a search point or what marks a
     finalist ("recommended", "baseline", "thesis's best", "finalist"); error, error_low, error_high (of the test split
-    for finalists, of the validation split for search points, 0 for analytic SPH); ms, ms_low, ms_high per frame;
-    measured, whether the time was measured or estimated; num_parameters; outcome; on_front; hyperparameters, a dict.
+    for finalists, of the validation split for search points, 0 for analytic SPH; the interval is empty where there are
+    too few seeds or units for one); ms, ms_low, ms_high per frame; measured, whether the time was measured or
+    estimated; num_parameters; outcome; on_front, by validation errors; hyperparameters, a dict.
     Search points without an error or a time are left out.
     """
     rows = [*_finalist_points(summary), *_search_points(summary)]
@@ -128,6 +136,17 @@ def rung_audit_table(summary: Mapping) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def _reference_rows(summary: Mapping) -> list[dict]:
+    trivial, analytic = summary["mean_predictor"], summary.get("analytic")
+    row = {"model": MEAN_PREDICTOR, "valid_normalized_mse": trivial["valid"], "normalized_mse": trivial["test"]}
+    rows = [row | {"relative_rmse": math.sqrt(trivial["test"])}]
+    if analytic:
+        exact = dict.fromkeys(("valid_normalized_mse", "normalized_mse", "relative_rmse"), 0.0)
+        times = {name: analytic[name] for name in ("ms_per_frame", "ms_low", "ms_high")}
+        rows.append({"model": ANALYTIC} | exact | times)
+    return rows
+
+
 def _finalist_points(summary: Mapping) -> list[dict]:
     marks = {"thesis_best": "thesis's best", summary["baseline"]: "baseline"}
     marks[summary["recommended"]["id"]] = "recommended"
@@ -138,8 +157,8 @@ def _finalist_points(summary: Mapping) -> list[dict]:
             "kind": "finalist",
             "group": marks.get(entry["id"], "finalist"),
             "error": entry["test"]["normalized_mse"],
-            "error_low": entry["test"]["ci95"][0],
-            "error_high": entry["test"]["ci95"][1],
+            "error_low": (entry["test"]["ci95"] or (math.nan, math.nan))[0],
+            "error_high": (entry["test"]["ci95"] or (math.nan, math.nan))[1],
             "ms": entry["cost"]["ms_per_frame"],
             "ms_low": entry["cost"]["ms_low"],
             "ms_high": entry["cost"]["ms_high"],

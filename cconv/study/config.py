@@ -60,9 +60,9 @@ class TrainingConfig(StrictModel):
 class SearchConfig(StrictModel):
     """What random and adaptive searches share: the space, ASHA's rungs, limits of a trial.
 
-    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped; 1 is predicting the mean. One
-    that has trained for `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency`
-    None means as many trials at once as cores.
+    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped. One that has trained for
+    `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency` None means as many
+    trials at once as cores.
     """
 
     space: PathText

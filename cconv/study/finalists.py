@@ -10,13 +10,8 @@ import numpy as np
 from cconv.data.targets import Sample
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
-from cconv.evaluation.metrics import (
-    blocks_of_errors,
-    crossed_interval,
-    frame_errors,
-    normalized_mse,
-    per_frame_normalized_mse,
-)
+from cconv.evaluation.metrics import blocks_of_errors, frame_errors, normalized_mse, per_frame_normalized_mse
+from cconv.evaluation.statistics import crossed_interval, why_no_interval
 from cconv.study.budget import fall_at_the_end
 from cconv.study.closed_form import fit_closed_form_finalists
 from cconv.study.config import StudyConfig, TrainingConfig
@@ -146,12 +141,12 @@ def retrained_finalists(
 
 
 def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> tuple[dict, np.ndarray]:
-    """Test errors of a finalist over its seeds.
+    """Errors of a finalist on a split, over its seeds.
 
     Args:
         finalist: The finalist.
-        samples: Frames of the test split.
-        frames_per_block: Frames of a unit of the interval where there is a single test trajectory.
+        samples: Frames of the split.
+        frames_per_block: Frames of a unit where the split has a single trajectory.
 
     Returns:
         What stands in summary.json, and the errors of each seed and unit (seeds, units).
@@ -160,21 +155,23 @@ def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per
     by_seed = [normalized_mse(seed) for seed in errors]
     per_frame = [per_frame_normalized_mse(seed) for seed in errors]
     units = np.stack([blocks_of_errors(seed, frames_per_block) for seed in errors])
-    if units.shape[1] == 1:  # a single short trajectory: its frames are all that can vary
-        units = np.stack([blocks_of_errors(seed, 1) for seed in errors])
     mean = float(np.mean(by_seed))
+    interval = crossed_interval(units)
     facts = {
         "normalized_mse": mean,
         "relative_rmse": math.sqrt(mean),
         "per_frame_normalized_mse": None if None in per_frame else float(np.mean(per_frame)),
-        "ci95": list(crossed_interval(units, mean)),
+        "ci95": None if interval is None else [min(interval[0], mean), max(interval[1], mean)],
+        "why_no_interval": why_no_interval(*units.shape),
         "by_seed": dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         "units": {"count": units.shape[1], "worst": float(units.mean(axis=0).max())},
     }
     return facts, units
 
 
-def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder) -> dict:
+def finalist_entry(
+    finalist: Retrained, valid: Mapping, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder
+) -> dict:
     """A finalist's entry in summary.json."""
     config = finalist.records[0].config
     return {
@@ -183,7 +180,7 @@ def finalist_entry(finalist: Retrained, test: Mapping, cost: Cost, stability: Ma
         "num_parameters": config["num_parameters"],
         "updates": config["training"]["updates"],
         "fall_at_the_end": fall_at_the_end(finalist.records),
-        "valid": {"normalized_mse": float(np.mean(finalist.valid_errors))},
+        "valid": dict(valid),
         "test": dict(test),
         "cost": asdict(cost),
         "stability": dict(stability),

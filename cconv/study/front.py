@@ -1,10 +1,69 @@
 """The front of error against cost with its uncertainty: hypervolume, and what is attained at each cost."""
 
+import statistics
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from cconv.errors import DataError, ShapeError
+from cconv.evaluation.statistics import mean_interval, paired_logarithms, times_tie, why_no_interval
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time of a model, timed in turn with others.
+
+    Attributes:
+        turns: Time of each turn, ms per frame; the same turn of all models met the same frame and the same machine.
+    """
+
+    turns: tuple[float, ...]
+
+    @property
+    def ms(self) -> float:
+        """Median time, ms per frame."""
+        return statistics.median(self.turns)
+
+    def is_slower(self, other: "Timing") -> bool:
+        """Whether it takes longer than another beyond the noise of the timing, by `times_tie`."""
+        return self.ms > other.ms and not times_tie(self.turns, other.turns)
+
+
+def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Names of the points that no other point beats in one value without losing in the other.
+
+    Args:
+        points: (error, cost) of each name; smaller is better.
+
+    Returns:
+        The front, cheapest first.
+    """
+    front: list[str] = []
+    best_error = float("inf")
+    for name, (error, _) in sorted(points.items(), key=lambda item: (item[1][1], item[1][0])):
+        if error < best_error:
+            front.append(name)
+            best_error = error
+    return front
+
+
+def timed_front(errors: Mapping[str, float], times: Mapping[str, Timing]) -> list[str]:
+    """Names of the models than which no more accurate one is as fast, times within their noise being ties.
+
+    Args:
+        errors: Error of each model.
+        times: Time of each model.
+
+    Returns:
+        The front, fastest first; errors fall along it.
+    """
+    order = sorted(errors, key=lambda name: (errors[name], times[name].ms))
+    front: list[str] = []
+    for name in order:  # from the most accurate on: one stays if it is faster than all that are more accurate
+        if all(times[better].is_slower(times[name]) for better in order[: order.index(name)]):
+            front.append(name)
+    return front[::-1]
 
 
 def hypervolume(points: Iterable[tuple[float, float]], reference: tuple[float, float]) -> float:
@@ -28,39 +87,49 @@ def hypervolume(points: Iterable[tuple[float, float]], reference: tuple[float, f
     return float(area)
 
 
-def bootstrap_hypervolume(
-    errors: Mapping[str, np.ndarray],
-    cost: Mapping[str, float],
-    reference: tuple[float, float],
-    *,
-    resamples: int = 1000,
-    seed: int = 0,
+def hypervolume_interval(
+    errors: Mapping[str, np.ndarray], cost: Mapping[str, float], reference: tuple[float, float]
 ) -> dict:
-    """Hypervolume of the mean errors, with the percentile interval of seeds and units redrawn.
+    """Hypervolume of the typical errors of all models, with its 95 % interval over other seeds and units.
 
-    The same units are redrawn for all models, and the same seeds for those that have as many.
+    A typical error is the geometric mean over seeds and units. On logarithmic axes the area is a sum of the logarithms
+    of the errors on the front times the steps in cost, so that each seed and unit has an area of its own, and the
+    interval is that of their mean. It takes for granted which models are on the front.
 
     Args:
         errors: Errors (seeds, units) by model; the units are those of all models.
         cost: Cost by model, e.g. ms per frame.
         reference: (error, cost) of the corner.
-        resamples: Bootstrap resamples.
-        seed: Seed of the resampling.
 
     Returns:
-        "hypervolume", "ci95" and "reference".
+        "value", "ci95" (None where "why_no_interval" has a reason) and "reference".
 
     Raises:
         ShapeError: If the models differ in their units.
-        DataError: If there is no model, or none has a cost.
+        DataError: If there is no model, or one has no cost.
     """
     _check(errors, cost)
-    means = _redrawn_means(errors, resamples, seed)
-    costs = [cost[name] for name in errors]
-    areas = [hypervolume(zip(row, costs, strict=True), reference) for row in means]
-    of_means = hypervolume([(float(np.mean(errors[name])), cost[name]) for name in errors], reference)
-    interval = [float(end) for end in np.percentile(areas, (2.5, 97.5))]
-    return {"hypervolume": of_means, "ci95": interval, "reference": [float(value) for value in reference]}
+    logarithms = dict(
+        zip(errors, (table / np.log(10) for table in paired_logarithms(list(errors.values()))), strict=True)
+    )
+    typical = {name: (10 ** float(table.mean()), cost[name]) for name, table in logarithms.items()}
+    area = hypervolume(typical.values(), reference)
+    corner_error, corner_cost = reference
+    inside = {name: point for name, point in typical.items() if point[0] < corner_error and point[1] < corner_cost}
+    front = pareto_front(inside)
+    steps = np.diff(np.log10([*(cost[name] for name in front), corner_cost]))
+    shape = next(iter(logarithms.values())).shape
+    deviations = sum(
+        (step * (table.mean() - table) for step, table in zip(steps, map(logarithms.get, front), strict=True)),
+        np.zeros(shape),
+    )
+    interval = mean_interval(area + deviations)
+    return {
+        "value": area,
+        "ci95": None if interval is None else [max(interval[0], 0.0), interval[1]],
+        "why_no_interval": why_no_interval(*shape),
+        "reference": [float(value) for value in reference],
+    }
 
 
 def attainment(
@@ -74,8 +143,9 @@ def attainment(
     """Error that one training of each model attains at a cost: a band of step functions.
 
     A draw takes one seed of each model, and its mean error over the units; the smallest error among the models of at
-    most a given cost is what it attains there. Source: Grunert da Fonseca, Fonseca and Hall, "Inferential Performance
-    Assessment of Stochastic Optimisers and the Attainment Function" (EMO 2001).
+    most a given cost is what it attains there. The band describes the seeds that were trained and is no confidence
+    interval: others may fall outside more often. Source: Grunert da Fonseca, Fonseca and Hall, "Inferential
+    Performance Assessment of Stochastic Optimisers and the Attainment Function" (EMO 2001).
 
     Args:
         errors: Errors (seeds, units) by model.
@@ -97,17 +167,6 @@ def attainment(
     attained = np.minimum.accumulate(drawn, axis=1)
     low, median, high = np.quantile(attained, (levels[0], 0.5, levels[1]), axis=0).tolist()
     return {"cost": [float(cost[name]) for name in names], "low": low, "median": median, "high": high}
-
-
-def _redrawn_means(errors: Mapping[str, np.ndarray], resamples: int, seed: int) -> np.ndarray:
-    """Mean error of each model in each resample, (resamples, models)."""
-    rng = np.random.default_rng(seed)
-    units = next(iter(errors.values())).shape[1]
-    columns = rng.integers(units, size=(resamples, 1, units))
-    rows = {
-        count: rng.integers(count, size=(resamples, count, 1)) for count in sorted({len(e) for e in errors.values()})
-    }
-    return np.stack([table[rows[len(table)], columns].mean(axis=(1, 2)) for table in errors.values()], axis=1)
 
 
 def _check(errors: Mapping[str, np.ndarray], cost: Mapping[str, float]) -> None:

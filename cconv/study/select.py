@@ -1,9 +1,10 @@
-"""The select stage: the finalists tested, timed and stressed, one of them recommended, and the study summed up."""
+"""The select stage: one finalist chosen by validation, time and stability, all tested, and the study summed up."""
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -12,6 +13,7 @@ from cconv.data.splits import evenly_spaced
 from cconv.data.targets import Sample
 from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
+from cconv.evaluation.metrics import mean_predictor_error, normalized_mse
 from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.sph.kernels import AbstractKernel, kernel_named
@@ -25,10 +27,10 @@ from cconv.study.finalists import (
     finalist_entry,
     retrained_finalists,
 )
-from cconv.study.front import attainment, bootstrap_hypervolume
+from cconv.study.front import Timing, attainment, hypervolume_interval, timed_front
 from cconv.study.problem import Problem, study_samples
 from cconv.study.records import RunFolder, count_outcomes
-from cconv.study.selection import Recommendation, pareto_front, recommend
+from cconv.study.selection import Recommendation, recommend, retrained_error
 from cconv.study.session import Session
 from cconv.study.stages import BASELINE, reads_of
 from cconv.training.checkpoint import load_model
@@ -38,7 +40,7 @@ GROWTH_REPEATS = 3
 
 
 def select(session: Session, stage: str) -> dict:
-    """Test, time and stress the finalists, recommend one, write summary.json.
+    """Choose a finalist by validation errors, time and stability; then read the test split, once; write summary.json.
 
     Raises:
         StudyError: If no finalist could be retrained.
@@ -47,46 +49,92 @@ def select(session: Session, stage: str) -> dict:
     study, run = session.study, session.run
     finalists, failed = _finalists(session, stage)
     check_any_finished(run, finalists, failed)
+    judged = _judge(session, finalists)
+    growth = _growth(session, finalists)
     samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
-    tests, errors = _test(session, finalists, samples)
-    timed, analytic = _time(session, finalists)
-    costs = {finalist.id: timed[finalist.id] for finalist in finalists}
-    stability = _stress(session, finalists)
-    chosen = recommend(
-        errors,
-        {name: cost.ms_per_frame for name, cost in costs.items()},
-        {name: checks["failures"] for name, checks in stability.items()},
-        accurate_enough=study.selection.accurate_enough,
-        margin=study.selection.margin,
-    )
-    _explain(run, [each for each in finalists if each.id in (BASELINE, chosen.id)], samples)
+    tests, test_errors = _errors(session, finalists, samples, "test errors")
+    _explain(run, [each for each in finalists if each.id in (BASELINE, judged.chosen.id)], samples)
     environment = run.read("environment.json")
     for finalist in finalists:
         complete_cards(finalist, tests[finalist.id], environment)
-    milliseconds = {name: cost.ms_per_frame for name, cost in costs.items()}
-    entries = [finalist_entry(each, tests[each.id], costs[each.id], stability[each.id], run) for each in finalists]
-    found = _of_earlier_stages(session, stage)
+    trivial, found = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
+    entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
     summary = {
         "study": study.name,
         "task": study.task,
         "dataset": _dataset(session, samples),
         "baseline": BASELINE,
+        "mean_predictor": trivial,
         "finalists": entries,
         "budget": budget_words(entries, found.get("convergence", {}), study.selection.margin),
         "failed_finalists": failed,
-        "pareto_front": pareto_front({name: (tests[name]["normalized_mse"], milliseconds[name]) for name in tests}),
-        "front": _front(errors, milliseconds),
-        "recommended": {"id": chosen.id, "reason": chosen.reason},
-        "selection": _selection(chosen, study.selection.margin),
-        **points_of_search(session.count_cost, run.trials(), timed),
-        "analytic": asdict(analytic),
-        "growth": _growth(session, finalists),
+        "pareto_front": timed_front({name: float(np.mean(e)) for name, e in judged.errors.items()}, judged.times),
+        "front": _front(test_errors, judged.times, trivial["test"]),
+        "recommended": {"id": judged.chosen.id, "reason": judged.chosen.reason},
+        "selection": _selection(judged, test_errors, study.selection.margin),
+        **points_of_search(session.count_cost, run.trials(), judged.costs),
+        "analytic": asdict(judged.analytic),
+        "growth": growth,
         "trials": _counts(run),
         **found,
         "wall_seconds": _seconds_before(session, stage) + time.perf_counter() - start,
     }
     run.write("summary.json", summary)
-    return {"recommended": chosen.id}
+    return {"recommended": judged.chosen.id}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """What the finalists are chosen by, none of it from the test split.
+
+    Attributes:
+        facts: Validation errors of each, as they stand in the summary.
+        errors: The same by (seeds, units).
+        costs: Cost of each, and of some trials.
+        analytic: Cost of the analytic field, timed in turn with them.
+        times: Time of each.
+        stability: Checks of each.
+        choose: Validation errors of the finalists to a recommendation.
+        chosen: The recommendation by all seeds.
+    """
+
+    facts: dict[str, dict]
+    errors: dict[str, np.ndarray]
+    costs: dict[str, Cost]
+    analytic: AnalyticCost
+    times: dict[str, Timing]
+    stability: dict[str, dict]
+    choose: Callable[[Mapping[str, np.ndarray]], Recommendation]
+    chosen: Recommendation
+
+
+def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
+    settings = session.study.selection
+    facts, errors = _errors(session, finalists, session.problem.valid_samples, "validation errors")
+    (costs, analytic), stability = _time(session, finalists), _stress(session, finalists)
+    times = {name: Timing(costs[name].turns_ms) for name in facts}
+    choose = partial(
+        recommend,
+        times=times,
+        failures={name: checks["failures"] for name, checks in stability.items()},
+        accurate_enough=settings.accurate_enough,
+        margin=settings.margin,
+    )
+    return _Judged(
+        facts=facts,
+        errors=errors,
+        costs=costs,
+        analytic=analytic,
+        times=times,
+        stability=stability,
+        choose=choose,
+        chosen=choose(errors),
+    )
+
+
+def _entry(finalist: Retrained, judged: _Judged, test: Mapping, run: RunFolder) -> dict:
+    facts, cost, stability = (each[finalist.id] for each in (judged.facts, judged.costs, judged.stability))
+    return finalist_entry(finalist, facts, test, cost, stability, run)
 
 
 def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str, str]]:
@@ -94,13 +142,19 @@ def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str,
     return retrained_finalists(session.run, ids, session.study.finalists.seeds)
 
 
-def _test(
-    session: Session, finalists: Sequence[Retrained], samples: Sequence[Sample]
+def _errors(
+    session: Session, finalists: Sequence[Retrained], samples: Sequence[Sample], label: str
 ) -> tuple[dict[str, dict], dict[str, np.ndarray]]:
-    """Test errors of each finalist, as facts and by (seeds, units)."""
+    """Errors of each finalist on a split, as facts and by (seeds, units)."""
     frames = session.study.finalists.frames_per_block
-    both = {each.id: evaluate_finalist(each, samples, frames) for each in session.progress(finalists, "test errors")}
+    both = {each.id: evaluate_finalist(each, samples, frames) for each in session.progress(finalists, label)}
     return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
+
+
+def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> dict[str, float]:
+    """What a model must be below on each split to know anything: the error of predicting the training mean there."""
+    train, splits = session.problem.train_samples, {"valid": session.problem.valid_samples, "test": test_samples}
+    return {split: normalized_mse(mean_predictor_error(samples, train)) for split, samples in splits.items()}
 
 
 def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
@@ -179,17 +233,16 @@ def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[S
         np.savez_compressed(folder / f"{finalist.id}.npz", **arrays)
 
 
-def _selection(chosen: Recommendation, margin: float) -> dict:
+def _selection(judged: _Judged, test_errors: Mapping[str, np.ndarray], margin: float) -> dict:
+    chosen = judged.chosen
     comparisons = [
         {
             "id": each.id,
             "error": each.error,
-            "cost": each.cost,
-            "difference": each.to_best.difference,
-            "standard_error": each.to_best.standard_error,
-            "ci95": list(each.to_best.ci95),
+            "ms_per_frame": each.time.ms,
             "ratio": each.to_best.ratio,
-            "ratio_ci95": list(each.to_best.ratio_ci95),
+            "log_standard_error": each.to_best.log_standard_error,
+            "ci95": each.to_best.ci95,
             "within_one_se": each.within_one_se,
             "non_inferior": each.non_inferior,
             "accurate_enough": each.accurate_enough,
@@ -199,19 +252,27 @@ def _selection(chosen: Recommendation, margin: float) -> dict:
         }
         for each in chosen.comparisons
     ]
-    return {"margin": margin, "best": chosen.best, "by_rule": chosen.by_rule, "comparisons": comparisons}
+    return {
+        "units": next(iter(judged.errors.values())).shape[1],
+        "margin": margin,
+        "best": chosen.best,
+        "tied": list(chosen.tied),
+        "by_rule": chosen.by_rule,
+        "comparisons": comparisons,
+        "retrained": retrained_error(judged.errors, test_errors, lambda errors: judged.choose(errors).id),
+    }
 
 
-def _front(errors: Mapping[str, np.ndarray], milliseconds: Mapping[str, float]) -> dict:
-    """Attainment band over seeds, and the hypervolume up to predicting the mean at the cost of the slowest finalist."""
+def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst: float) -> dict:
+    """Test errors: attainment band over seeds, and the hypervolume up to the mean predictor at the slowest time."""
+    milliseconds = {name: timing.ms for name, timing in times.items()}
     band = attainment(errors, milliseconds)
-    corner = (1.0, max(milliseconds.values()))
-    area = bootstrap_hypervolume(errors, milliseconds, corner)
+    corner = (worst, max(milliseconds.values()))
+    area = hypervolume_interval(errors, milliseconds, corner)
     steps = zip(band["cost"], band["median"], band["low"], band["high"], strict=True)
-    low, high = area["ci95"]
     return {
         "attainment": [dict(zip(("ms_per_frame", "median", "low", "high"), step, strict=True)) for step in steps],
-        "hypervolume": {"value": area["hypervolume"], "low": low, "high": high, "reference": [corner[1], corner[0]]},
+        "hypervolume": area | {"reference": [corner[1], corner[0]]},
     }
 
 

@@ -1,35 +1,24 @@
 """Which models to look at closer, and which one to recommend: no more than the scene needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
 from cconv.errors import DataError
-from cconv.evaluation.statistics import PairedDifference, crossed_standard_error, paired_difference
+from cconv.evaluation.statistics import (
+    PairedRatio,
+    crossed_standard_error,
+    paired_logarithms,
+    paired_ratio,
+    why_no_interval,
+)
+from cconv.study.front import Timing, pareto_front
 from cconv.study.records import TrialRecord
 
 SHOWN_FAILURES = 2  # of a model, in words
 RULES = ("one_standard_error", "non_inferiority", "accurate_enough")
-
-
-def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the points that no other point beats in one value without losing in the other.
-
-    Args:
-        points: (error, cost) of each name; smaller is better.
-
-    Returns:
-        The front, cheapest first.
-    """
-    front: list[str] = []
-    best_error = float("inf")
-    for name, (error, _) in sorted(points.items(), key=lambda item: (item[1][1], item[1][0])):
-        if error < best_error:
-            front.append(name)
-            best_error = error
-    return front
 
 
 def choose_finalists(
@@ -61,15 +50,15 @@ def choose_finalists(
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """A model beside the best one.
+    """A model beside the best one, by validation errors.
 
     Attributes:
         id: Its name.
-        error: Mean test error over seeds and units.
-        cost: ms per frame.
-        to_best: Paired difference to the best model.
-        within_one_se: Whether the difference is at most its standard error, and at most that of the best's own error.
-        non_inferior: Whether the upper end of its interval is at most the margin.
+        error: Mean validation error over seeds and units.
+        time: ms per frame, by turns.
+        to_best: Its errors by those of the best model, on the same seeds and units.
+        within_one_se: Whether the logarithm of that ratio is at most its standard error, and that of the best's error.
+        non_inferior: Whether the upper end of the ratio's interval is at most 1 + the margin; False without interval.
         accurate_enough: Whether the error is at most the study's limit; False without one.
         failures: Checks of stability that it failed.
         eligible: Whether it may be recommended, by any rule.
@@ -78,8 +67,8 @@ class Comparison:
 
     id: str
     error: float
-    cost: float
-    to_best: PairedDifference
+    time: Timing
+    to_best: PairedRatio
     within_one_se: bool
     non_inferior: bool
     accurate_enough: bool
@@ -105,141 +94,213 @@ class Recommendation:
     Attributes:
         id: The recommended model.
         reason: The reason in words.
-        best: The most accurate model of those chosen from.
-        by_rule: The cheapest model that each of `RULES` alone would choose, None where it chooses none.
-        comparisons: Every model beside the best, cheapest first.
+        best: The model of the smallest validation error, of those chosen from.
+        tied: Models that are as fast as the fastest eligible one within the noise of the timing, that one included;
+            of these, the recommended one has the smallest validation error.
+        by_rule: The model that each of `RULES` alone would choose, None where it chooses none.
+        comparisons: Every model beside the best, fastest first.
     """
 
     id: str
     reason: str
     best: str
+    tied: tuple[str, ...]
     by_rule: dict[str, str | None]
     comparisons: tuple[Comparison, ...]
 
 
 def recommend(
     errors: Mapping[str, np.ndarray],
-    cost: Mapping[str, float],
+    times: Mapping[str, Timing],
     failures: Mapping[str, Sequence[str]],
     *,
     accurate_enough: float | None = None,
     margin: float = 0.05,
 ) -> Recommendation:
-    """The cheapest stable model that is as accurate as the best one, or accurate enough.
+    """The fastest stable model that is as accurate as the best one, or accurate enough; ties go to the smaller error.
 
-    As accurate is within one standard error of the best, or not inferior: the upper end of the BCa interval of the
-    paired difference is within the margin. The standard error is that of the difference or that of the best model's own
-    error, whichever is smaller: a model of which one seed failed would pass for its scatter alone. The best is the most
-    accurate of the stable models; if none is stable, all are chosen from, and the reason says so.
+    It takes validation errors: the error of a model that was chosen by its luck on some units is too small on those
+    very units, so that the test split is for reporting what was chosen. The search for finalists and the choice of each
+    checkpoint went by validation errors as well; for that reason, too, they are never what is reported.
+
+    As accurate is within one standard error of the best, or not inferior: the upper end of the 95 % interval of the
+    ratio of errors is within the margin. The standard error is that of the ratio or that of the best model's own error,
+    whichever is smaller: a model of which one seed failed would pass for its scatter alone. The best is the most
+    accurate of the stable models; if none is stable, all are chosen from, and the reason says so. Models whose times
+    differ by no more than the noise of the timing are ties.
 
     Sources: the one-standard-error rule of Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3;
     Chen and Yang, "The One Standard Error Rule for Model Selection: Does It Work?", Stats 4 (2021).
 
     Args:
-        errors: Test errors (seeds, units) by model, one row where no seed is drawn; seeds and units are the same.
-        cost: ms per frame, by model.
+        errors: Validation errors (seeds, units) by model, one row where no seed is drawn; seeds and units are the same.
+        times: ms per frame, by model.
         failures: Checks of stability that each model failed; those that failed none may be left out.
         accurate_enough: Error up to which models count as equally accurate; None for no such limit.
         margin: Margin of non-inferiority, as a share of the best error.
 
     Raises:
-        DataError: If there is no model, or one has no cost.
+        DataError: If there is no model, or one has no time.
     """
-    missing = sorted(errors.keys() - cost.keys())
+    missing = sorted(errors.keys() - times.keys())
     if not errors or missing:
-        raise DataError(f"a recommendation needs error and cost of each model; missing: {missing or 'every model'}.")
-    means = {name: float(np.mean(values)) for name, values in errors.items()}
-    stable = [name for name in errors if not failures.get(name)]
-    best = min(stable or errors, key=lambda name: (means[name], cost[name]))
-    limits = {
-        "one_se": crossed_standard_error(np.asarray(errors[best], dtype=float))[0],
-        "margin": margin * means[best],
-        "accurate_enough": accurate_enough,
-    }
-    comparisons = tuple(
-        _compare(name, errors, best, cost[name], tuple(failures.get(name, ())), any_stable=bool(stable), **limits)
-        for name in sorted(errors, key=lambda name: (cost[name], means[name]))
-    )
+        raise DataError(f"a recommendation needs error and time of each model; missing: {missing or 'every model'}.")
+    comparisons = _comparisons(errors, times, failures, accurate_enough, margin)
     eligible = [each for each in comparisons if each.eligible]
-    by_rule = {rule: next((each.id for each in eligible if each.passes(rule)), None) for rule in RULES}
+    tied = _as_fast_as_the_first(eligible)
+    chosen = min(tied, key=lambda each: each.error)
+    by_rule = {rule: _fastest_by(rule, eligible) for rule in RULES}
+    best = next(each for each in comparisons if each.id == _best(errors, times, failures))
     words = [
-        _choice(eligible[0], next(each for each in comparisons if each.id == best), comparisons, accurate_enough),
-        _rules(eligible[0], by_rule, margin),
-        _stability(eligible[0], comparisons),
+        _choice(chosen, best, comparisons, tied, accurate_enough),
+        _tie(chosen, tied),
+        _rules(chosen, by_rule, margin, _why_no_interval(errors)),
+        _stability(chosen, comparisons),
     ]
     return Recommendation(
-        id=eligible[0].id, reason=" ".join(words), best=best, by_rule=by_rule, comparisons=comparisons
+        id=chosen.id,
+        reason=" ".join(filter(None, words)),
+        best=best.id,
+        tied=tuple(each.id for each in tied),
+        by_rule=by_rule,
+        comparisons=comparisons,
     )
 
 
-def _compare(
-    name: str,
-    errors: Mapping[str, np.ndarray],
-    best: str,
-    cost: float,
-    failures: tuple[str, ...],
-    *,
-    any_stable: bool,
-    one_se: float,
-    margin: float,
-    accurate_enough: float | None,
-) -> Comparison:
-    error, to_best = float(np.mean(errors[name])), paired_difference(errors[name], errors[best])
-    good = {
-        "within_one_se": to_best.difference <= min(to_best.standard_error, one_se),
-        "non_inferior": to_best.ci95[1] <= margin,
-        "accurate_enough": accurate_enough is not None and error <= accurate_enough,
+def retrained_error(
+    valid: Mapping[str, np.ndarray], test: Mapping[str, np.ndarray], choose: Callable[[Mapping], str]
+) -> dict | None:
+    """Error to expect of the chosen model if it is trained again, free of the luck of the seeds that it was chosen by.
+
+    Validation and test errors of a model share its trained networks: their mean test error is fair to these networks,
+    but if seeds vary much and models little, the chosen one is the one with the lucky seeds. So each seed in turn is
+    left out, a model chosen by the validation errors of the others, and its test error taken with the seed left out.
+
+    Args:
+        valid: Validation errors (seeds, units) by model, one row where no seed is drawn.
+        test: Test errors, likewise.
+        choose: Validation errors to the name of the chosen model.
+
+    Returns:
+        "normalized_mse", mean over the seeds; "choices", how often each model was chosen. None without several seeds.
+    """
+    seeds = max(len(table) for table in valid.values())
+    if seeds < 2:
+        return None
+    found = []
+    for seed in range(seeds):
+        kept = {name: table if len(table) == 1 else np.delete(table, seed, axis=0) for name, table in valid.items()}
+        name = choose(kept)
+        found.append((name, float(test[name][seed % len(test[name])].mean())))
+    names = [name for name, _ in found]
+    return {
+        "normalized_mse": float(np.mean([error for _, error in found])),
+        "choices": {name: names.count(name) for name in dict.fromkeys(names)},
     }
-    unstable = any_stable and bool(failures)
-    why_not = f"failed {_shortly(failures)}" if unstable else "" if any(good.values()) else "less accurate"
-    return Comparison(
-        id=name,
-        error=error,
-        cost=cost,
-        to_best=to_best,
-        failures=failures,
-        eligible=not why_not,
-        why_not=why_not,
-        **good,
-    )
+
+
+def _best(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], failures: Mapping) -> str:
+    """The most accurate of the stable models, or of all if none is stable."""
+    stable = [name for name in errors if not failures.get(name)]
+    return min(stable or errors, key=lambda name: (float(np.mean(errors[name])), times[name].ms))
+
+
+def _comparisons(
+    errors: Mapping[str, np.ndarray],
+    times: Mapping[str, Timing],
+    failures: Mapping[str, Sequence[str]],
+    accurate_enough: float | None,
+    margin: float,
+) -> tuple[Comparison, ...]:
+    """Every model beside the best, fastest first."""
+    best = _best(errors, times, failures)
+    own_se = crossed_standard_error(paired_logarithms([errors[best]])[0])[0]
+    none_stable = bool(failures.get(best))
+    comparisons = []
+    for name in sorted(errors, key=lambda name: (times[name].ms, float(np.mean(errors[name])))):
+        error, to_best = float(np.mean(errors[name])), paired_ratio(errors[name], errors[best])
+        good = {
+            "within_one_se": to_best.log_ratio <= min(to_best.log_standard_error, own_se),
+            "non_inferior": name == best or (to_best.ci95 is not None and to_best.ci95[1] <= 1 + margin),
+            "accurate_enough": accurate_enough is not None and error <= accurate_enough,
+        }
+        failed = tuple(failures.get(name, ()))
+        unstable = bool(failed) and not none_stable
+        why_not = f"failed {_shortly(failed)}" if unstable else "" if any(good.values()) else "less accurate"
+        facts = {"failures": failed, "eligible": not why_not, "why_not": why_not}
+        comparisons.append(Comparison(id=name, error=error, time=times[name], to_best=to_best, **good, **facts))
+    return tuple(comparisons)
+
+
+def _as_fast_as_the_first(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Those of some models, fastest first, that are not slower than the first beyond the noise of the timing."""
+    return [each for each in comparisons if not each.time.is_slower(comparisons[0].time)]
+
+
+def _fastest_by(rule: str, eligible: Sequence[Comparison]) -> str | None:
+    """What a rule alone would choose."""
+    passing = [each for each in eligible if each.passes(rule)]
+    return min(_as_fast_as_the_first(passing), key=lambda each: each.error).id if passing else None
 
 
 def _choice(
-    chosen: Comparison, best: Comparison, comparisons: Sequence[Comparison], accurate_enough: float | None
+    chosen: Comparison,
+    best: Comparison,
+    comparisons: Sequence[Comparison],
+    tied: Sequence[Comparison],
+    accurate_enough: float | None,
 ) -> str:
-    figures = f"test error {chosen.error:.3g} at {chosen.cost:.3g} ms per frame"
+    figures = f"validation error {chosen.error:.3g} at {chosen.time.ms:.3g} ms per frame"
     if chosen is best:
-        cheaper = [each for each in comparisons if each.cost < best.cost]
-        return f"{best.id} is the most accurate model ({figures}), and {_none_cheaper(best, cheaper)}."
+        faster = [each for each in comparisons if best.time.is_slower(each.time)]
+        return f"{best.id} is the most accurate model ({figures}), and {_none_faster(best, faster)}."
     rules = {
         "one_standard_error": "within one standard error of the best",
         "non_inferiority": "not inferior to the best",
         "accurate_enough": f"accurate enough for this study (limit {accurate_enough})",
     }
     passed = " and ".join(words for rule, words in rules.items() if chosen.passes(rule))
+    cheapest = (
+        f"the cheapest model ({figures}) that is" if len(tied) == 1 else f"among the cheapest ({figures}) that are"
+    )
     return (
-        f"{chosen.id} is the cheapest model ({figures}) that is {passed}. The best is {best.id} with {best.error:.3g} "
-        f"at {best.cost:.3g} ms per frame, {best.cost / chosen.cost:.3g} times the cost.{_ratio(chosen)}"
+        f"{chosen.id} is {cheapest} {passed}. The best is {best.id} with {best.error:.3g} "
+        f"at {best.time.ms:.3g} ms per frame, {best.time.ms / chosen.time.ms:.3g} times the cost.{_ratio(chosen)}"
     )
 
 
-def _none_cheaper(best: Comparison, cheaper: Sequence[Comparison]) -> str:
-    if not cheaper:
-        return "it is also the cheapest"
-    if any(each.stable or not best.stable for each in cheaper):
+def _none_faster(best: Comparison, faster: Sequence[Comparison]) -> str:
+    if not faster:
+        return "none is cheaper beyond the noise of the timing"
+    if any(each.stable or not best.stable for each in faster):
         return "no cheaper one is as accurate"
     return "no cheaper one is stable"
 
 
 def _ratio(chosen: Comparison) -> str:
-    if chosen.to_best.ratio is None:
+    compared = chosen.to_best
+    low, high = compared.ci95 or (None, None)
+    interval = "" if low is None else f" (95 % interval {low:.3g} to {high:.3g})"
+    return f" The validation error of {chosen.id} is {compared.ratio:.3g} times that of the best{interval}."
+
+
+def _tie(chosen: Comparison, tied: Sequence[Comparison]) -> str:
+    others = [each.id for each in tied if each is not chosen]
+    if not others:
         return ""
-    low, high = chosen.to_best.ratio_ci95
-    interval = f"95 % interval {low:.3g} to {high:.3g}"
-    return f" The error of {chosen.id} is {chosen.to_best.ratio:.3g} times that of the best ({interval})."
+    return (
+        f"The timing cannot tell {chosen.id} from {', '.join(others)} (now one is faster, now the "
+        "other); of these, it has the smallest validation error."
+    )
 
 
-def _rules(chosen: Comparison, by_rule: Mapping[str, str | None], margin: float) -> str:
+def _why_no_interval(errors: Mapping[str, np.ndarray]) -> str:
+    return why_no_interval(max(len(table) for table in errors.values()), next(iter(errors.values())).shape[1])
+
+
+def _rules(chosen: Comparison, by_rule: Mapping[str, str | None], margin: float, why_not: str) -> str:
+    if why_not:
+        return f"Whether others are not inferior cannot be told: {why_not}."
     one_se, non_inferior = by_rule["one_standard_error"], by_rule["non_inferiority"]
     names = f"one standard error and non-inferiority (margin {100 * margin:g} %)"
     if one_se == non_inferior:

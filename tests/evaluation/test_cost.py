@@ -1,12 +1,10 @@
 import math
 import statistics
 
-import numpy as np
 import pytest
 from systems import kernel, periodic_frame, periodic_scene, problem
 
 from cconv.data.features import fluid_state, make_inputs
-from cconv.errors import ConfigError
 from cconv.evaluation import cost as costs
 from cconv.evaluation.cost import (
     ANALYTIC,
@@ -14,7 +12,6 @@ from cconv.evaluation.cost import (
     fluid_block,
     measure_costs,
     measure_growth,
-    times_tie,
 )
 from cconv.neighbors import radius_graph
 from cconv.sph import CubicSpline
@@ -91,40 +88,6 @@ def test_the_sum_of_densities_is_timed_where_a_model_needs_it(generator, monkeyp
         model = given.build_model(NetworkConfig(layers=1, kernel_size=3, density=density), 0)
         costs._time_prediction(model, periodic_frame(generator), periodic_scene())
         assert len(sums) == density
-
-
-def test_times_within_their_noise_tie():
-    rng = np.random.default_rng(0)
-    load = np.exp(rng.normal(0, 0.5, 20))  # other work on the machine, which slows both of a turn alike
-    noise = np.exp(rng.normal(0, 0.05, (2, 20)))
-    assert times_tie(load * noise[0], load * noise[1])
-    assert times_tie(1.01 * load, load)  # too little to choose by
-    assert not times_tie(1.2 * load * noise[0], load * noise[1])
-    assert not times_tie(load * noise[1], 1.2 * load * noise[0])
-
-
-def test_one_time_of_many_does_not_undo_a_tie():
-    times = np.ones(20)
-    spiked = times.copy()
-    spiked[3] = 100.0
-    assert times_tie(times, spiked)
-
-
-def test_five_turns_tell_nothing_apart_and_six_do():
-    assert times_tie([1.0] * 5, [2.0] * 5)
-    assert not times_tie([1.0] * 6, [2.0] * 6)
-
-
-def test_a_tie_is_declared_in_nineteen_of_twenty_equal_pairs():
-    rng = np.random.default_rng(0)
-    draws = np.exp(rng.normal(0, 0.5, (400, 2, 21)))
-    ties = np.mean([times_tie(*pair) for pair in draws])
-    assert 0.93 < ties <= 1
-
-
-def test_turns_of_different_runs_are_refused():
-    with pytest.raises(ConfigError, match="same turns"):
-        times_tie([1.0] * 6, [1.0] * 7)
 
 
 def field(dim, boundary_channels, spacing=0.1):

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -6,8 +8,8 @@ from systems import problem
 from cconv.evaluation.metrics import (
     FrameError,
     blocks_of_errors,
-    crossed_interval,
     frame_errors,
+    mean_predictor_error,
     normalized_mse,
     per_frame_normalized_mse,
 )
@@ -30,6 +32,21 @@ def test_predicting_the_training_mean_has_error_one_on_the_training_split(genera
     for parameter in model.parameters():
         torch.nn.init.zeros_(parameter)
     assert normalized_mse(frame_errors(model, given.train_samples)) == pytest.approx(1, rel=1e-5)
+
+
+@pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
+def test_the_mean_predictor_scores_one_on_the_training_split_and_its_own_on_others(task, generator):
+    given = problem(generator, task)
+    own = mean_predictor_error(given.train_samples, given.train_samples)
+    assert normalized_mse(own) == pytest.approx(1)
+    targets = torch.cat([sample.target for sample in given.train_samples]).double()
+    calm = [dataclasses.replace(sample, target=0.1 * sample.target) for sample in given.valid_samples]
+    expected = torch.cat([sample.target for sample in calm]).double() - targets.mean(dim=0)
+    expected = expected.square().mean() / targets.var(dim=0, correction=0).mean()
+    errors = mean_predictor_error(calm, given.train_samples)
+    assert normalized_mse(errors) == pytest.approx(expected.item())
+    assert normalized_mse(errors) < 0.1
+    assert len(blocks_of_errors(errors, 1)) == len(calm)
 
 
 def test_per_frame_error_divides_by_the_frames_own_variance(generator):
@@ -61,33 +78,3 @@ def test_frames_with_a_constant_target_do_not_count_in_the_per_frame_error():
     undefined = FrameError(trajectory="0", frame=0, num_particles=10, normalized_mse=1.0, per_frame_normalized_mse=None)
     assert per_frame_normalized_mse([undefined, error(0.5)]) == 0.5
     assert per_frame_normalized_mse([undefined]) is None
-
-
-def test_interval_is_positive_holds_the_mean_and_shrinks_to_a_constant():
-    table = np.random.default_rng(0).lognormal(size=(3, 4))
-    low, high = crossed_interval(table, table.mean())
-    assert 0 < low < table.mean() < high
-    assert crossed_interval(np.full((2, 3), 0.5), 0.5) == (0.5, 0.5)
-
-
-def test_interval_of_a_single_unit_covers_the_seeds():
-    low, high = crossed_interval(np.array([[1.0], [1.1], [1.2]]), 1.1)
-    assert low < 1.0
-    assert high > 1.2
-
-
-@pytest.mark.parametrize(("seeds", "units"), [(2, 1), (2, 3), (3, 3), (3, 4), (5, 12)])
-def test_interval_covers_the_true_mean_as_often_as_it_says(seeds, units):
-    """Crossed normal effects of 10 % around a known mean, at the sizes that studies use."""
-    rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(600):
-        effects = (
-            rng.normal(size=(seeds, 1)),
-            rng.normal(size=(1, units)) * (units > 1),
-            rng.normal(size=(seeds, units)),
-        )
-        table = 1 + 0.1 * sum(effects) / 3
-        low, high = crossed_interval(table, table.mean())
-        covered += low <= 1 <= high
-    assert 0.92 <= covered / 600 <= 1

@@ -54,7 +54,9 @@ def test_static_chart_has_log_axes_every_finalist_and_the_front(summary):
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     labels = " ".join(text.get_text() for text in axes.texts)
     assert all(entry["id"] in labels for entry in summary["finalists"])
-    assert {"front", "front over seeds", "random", "second look"} <= set(axes.get_legend_handles_labels()[1])
+    assert {"front by validation", "predicting the mean: 1.58", "random", "second look"} <= set(
+        axes.get_legend_handles_labels()[1]
+    )
     assert ANALYTIC in labels
 
 
@@ -79,10 +81,11 @@ def test_heights_keep_order_gap_and_range():
 def test_the_error_axis_shows_all_finalists_and_not_what_diverged(summary):
     summary["search_points"][0]["valid_normalized_mse"] = 1e9
     points = speed_accuracy_table(summary)
-    low, high = error_range(points)
+    low, high = error_range(points, 1.58)
     finalists = points[points["kind"] == "finalist"]
     assert low < finalists["error_low"].min()
-    assert finalists["error_high"].max() < high < 100
+    assert max(finalists["error_high"].max(), 1.58) < high < 100
+    assert error_range(points, 50.0)[1] > 50
 
 
 def test_interactive_chart_shows_every_point_with_its_hyperparameters(summary):
@@ -114,6 +117,36 @@ def test_stopped_trials_are_hollow_and_finalists_have_intervals(summary):
     assert chosen.y[0] - chosen.error_y.arrayminus[0] == pytest.approx(entry["test"]["ci95"][0])
 
 
+def test_a_finalist_without_an_interval_has_no_vertical_bars(summary):
+    entry = next(each for each in summary["finalists"] if each["id"] == summary["recommended"]["id"])
+    entry["test"]["ci95"] = None
+    chosen = {trace.name: trace for trace in interactive_chart(summary).data}["recommended"]
+    assert np.isnan(chosen.error_y.array).all()
+    assert "95 %" not in chosen.hovertext[0]
+    bars = [len(container.lines[2]) for container in speed_accuracy_chart(summary).axes[0].containers]
+    assert sorted(bars) == [1, *[2] * (len(summary["finalists"]) - 1)]
+
+
+def lines_at(axes, value, get):
+    """Lines of axes that lie at one value in one direction."""
+    return [line for line in axes.lines if set(getattr(line, get)()) == {value}]
+
+
+def test_every_chart_of_errors_shows_the_mean_predictors_own(run, summary):
+    """That of the split that the chart shows: 4.5 on the validation split, 1.58 on the test split."""
+    (tested,) = speed_accuracy_chart(summary).axes
+    assert len(lines_at(tested, 1.58, "get_ydata")) == 1
+    drawn = {trace.name: trace for trace in interactive_chart(summary).data}["predicting the mean: 1.58"]
+    assert set(drawn.y) == {1.58}
+    validated = [
+        *learning_curves_chart(curves_table(run), mean_predictor=4.5).axes,
+        *best_so_far_chart(trials_table(run), 4.5).axes,
+        *strategies_chart(summary).axes,
+    ]
+    assert [len(lines_at(axes, 4.5, "get_ydata")) for axes in validated] == [1, 1, 1, 1]
+    assert len(lines_at(ablation_chart(summary).axes[0], 4.5, "get_xdata")) == 1
+
+
 def test_interactive_html_holds_its_program_once(summary):
     html = interactive_html(summary)
     assert html.count("* plotly.js v") == 1
@@ -138,7 +171,7 @@ def test_the_chart_of_budgets_has_a_line_for_each_seed_of_each_finalist(run, sum
 
 def test_other_charts_show_their_records(summary):
     assert len(growth_chart(summary).axes[0].lines) == len(summary["finalists"])
-    assert len(strategies_chart(summary).axes[0].lines) == 2
+    assert len(strategies_chart(summary).axes[0].lines) == 2 + 1  # that of the mean predictor
     assert [axes.get_title() for axes in rung_audit_chart(summary).axes] == [
         "rank correlation",
         "recall of the best",

@@ -74,7 +74,7 @@ def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
         "provenance", "glossary",
     ]  # fmt: skip
     for figure in (
-        "7.52 (7.21 to 7.93)",
+        "95 % interval 7.21 to 7.93",
         "22.4 %",
         "4.21",
         "1.03",
@@ -85,6 +85,41 @@ def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
         "density left out",
     ):
         assert figure in whole_report
+
+
+def words(text):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", without_scripts(text)))
+
+
+def test_the_answer_says_what_it_was_chosen_by_and_what_is_reported(whole_run, whole_report):
+    summary, text = whole_run.read("summary.json"), words(whole_report)
+    chosen = next(each for each in summary["finalists"] if each["id"] == summary["recommended"]["id"])
+    assert "The choice was made by validation errors" in text
+    assert f"a normalized MSE of {chosen['test']['normalized_mse']:.3g} (95 % interval" in text
+    assert "has 1.58 on the test split" in text
+    assert "has a test error of 0.0321" in text
+    assert whole_report.count("<td>predicting the mean</td>") == 3  # finalists, comparisons, trials
+
+
+@pytest.mark.parametrize(("ms", "says"), [(1e-3, True), (1e3, False)])
+def test_the_answer_says_where_analytic_sph_is_cheaper_and_exact(whole_run, ms, says, monkeypatch):
+    monkeypatch.setattr(page, "_picture", lambda figure: "")
+    monkeypatch.setattr(page, "interactive_html", lambda summary: "")
+    before = whole_run.read("summary.json")
+    whole_run.write("summary.json", before | {"analytic": before["analytic"] | {"ms_per_frame": ms}})
+    assert ("It is cheaper than the recommended model, and exact" in words(render_report(whole_run))) == says
+    whole_run.write("summary.json", before)
+
+
+def test_an_interval_that_is_not_given_has_its_reason(run, monkeypatch):
+    monkeypatch.setattr(page, "_picture", lambda figure: "")
+    summary = run.read("summary.json")
+    for entry in summary["finalists"]:
+        entry["test"] |= {"ci95": None, "why_no_interval": "2 units say too little of others"}
+    run.write("summary.json", summary)
+    text = words(render_report(run))
+    assert "(no interval: 2 units say too little of others)" in text
+    assert "95 % interval 0" not in text
 
 
 def test_each_optional_part_can_be_missing(run, whole_run, monkeypatch):

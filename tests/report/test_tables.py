@@ -10,6 +10,7 @@ from summaries import whole_summary
 
 from cconv.report.tables import (
     ANALYTIC,
+    MEAN_PREDICTOR,
     curves_table,
     finalists_table,
     growth_table,
@@ -47,10 +48,25 @@ def test_curves_table_has_a_row_an_evaluation(run):
     assert (table["valid_normalized_mse"] > 0).all()
 
 
-def test_finalists_table_is_sorted_by_error(summary):
+def test_finalists_table_is_sorted_by_error_between_exact_and_trivial(summary):
     table = finalists_table(summary)
     assert table["normalized_mse"].is_monotonic_increasing
-    assert (table["ci95_low"] <= table["normalized_mse"]).all()
+    assert set(table["model"]) == {entry["id"] for entry in summary["finalists"]} | {ANALYTIC, MEAN_PREDICTOR}
+    trivial, exact = (table[table["model"] == name].iloc[0] for name in (MEAN_PREDICTOR, ANALYTIC))
+    assert (trivial["valid_normalized_mse"], trivial["normalized_mse"]) == (4.5, 1.58)
+    assert (exact["normalized_mse"], exact["ms_per_frame"]) == (0, summary["analytic"]["ms_per_frame"])
+
+
+def test_intervals_hold_the_error_or_are_empty(summary):
+    summary["finalists"][0]["test"] |= {"ci95": None, "why_no_interval": "2 units say too little"}
+    for table, value, low, high in (
+        (finalists_table(summary), "normalized_mse", "ci95_low", "ci95_high"),
+        (speed_accuracy_table(summary).query("kind == 'finalist'"), "error", "error_low", "error_high"),
+    ):
+        known = table[table[low].notna()]
+        assert len(known) == len(summary["finalists"]) - 1
+        assert (known[low] <= known[value]).all()
+        assert (known[value] <= known[high]).all()
 
 
 def test_speed_accuracy_table_has_every_point_with_an_error_once(summary):

@@ -1,4 +1,4 @@
-"""Variance decomposition: spreads are what they say, and intervals hold the true share as often as they claim."""
+"""Variance decomposition: spreads are what they say; evaluation/test_coverage.py says how often intervals hold."""
 
 import json
 
@@ -27,8 +27,7 @@ def test_each_rung_compares_what_reached_it():
     assert first["seed_spread"] == pytest.approx(np.sqrt(0.5))
     assert first["configuration_spread"] == pytest.approx(np.sqrt(2))
     assert first["seed_share"] == pytest.approx(0.25)
-    assert first["seed_share_ci95"][0] < 0.25 < first["seed_share_ci95"][1]
-    assert (second["seed_share"], second["seed_share_bootstrap_ci95"]) == (0.0, None)
+    assert (second["seed_share"], first["seed_share_ci95"], second["seed_share_ci95"]) == (0.0, None, None)
     json.dumps([first, second], allow_nan=False)
 
 
@@ -43,27 +42,8 @@ def test_configurations_without_spread_have_no_share():
 
 
 def test_the_unit_of_the_logarithm_does_not_matter(rng):
-    seeds, configurations = rng.normal(size=6), rng.normal(size=15)
+    seeds, configurations = rng.normal(size=8), rng.normal(size=15)
     entry, scaled = compare_variances(seeds, configurations), compare_variances(2 * seeds, 2 * configurations)
-    assert scaled["seed_share_bootstrap_ci95"] == pytest.approx(entry["seed_share_bootstrap_ci95"])
+    assert scaled["seed_share_ci95"] == pytest.approx(entry["seed_share_ci95"])
+    assert entry["seed_share_ci95"][0] < entry["seed_share"] < entry["seed_share_ci95"][1]
     assert scaled["seed_spread"] == pytest.approx(2 * entry["seed_spread"])
-
-
-def coverage(rng, draw_configurations, name, tables=400):
-    pairs = [(rng.normal(0, 0.1, 6), draw_configurations(0.2, size=15)) for _ in range(tables)]
-    intervals = [compare_variances(*pair, resamples=499)[name] for pair in pairs]
-    return np.mean([low <= 0.25 <= high for low, high in intervals])
-
-
-def draw_normal(rng):
-    return lambda spread, size: rng.normal(0, spread, size)
-
-
-def test_normal_logarithms_are_covered_by_both_intervals(rng):
-    assert 0.92 < coverage(rng, draw_normal(rng), "seed_share_ci95") < 0.98
-    assert coverage(rng, draw_normal(rng), "seed_share_bootstrap_ci95") > 0.93
-
-
-def test_skewed_configurations_need_the_bootstrap(rng):
-    assert coverage(rng, rng.exponential, "seed_share_ci95") < 0.91
-    assert coverage(rng, rng.exponential, "seed_share_bootstrap_ci95") > 0.93
