@@ -77,7 +77,7 @@ def stability(error: float) -> dict:
             "bulk": {"normalized_mse": error, "share": 0.9},
             "near_wall": {"normalized_mse": error, "share": 0.1},
         },
-        "stress": {"clumped": error, "isolated": 0.5 * error},
+        "stress": {"clumped": error, "isolated": None},
         "still": {"rest": 0.0, "uniform_velocity": 1e-9},
         "precision": 1e-6,
         "density_rollout": {"frames": 60, "drift": 1e-3, "largest": 1e-3, "first_frame_outside": None}
