@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from cconv.data.folders import whole_folder
+from cconv.data.hdf5_members import check_readable, linked_member
 from cconv.data.metadata import (
     METADATA,
     default_mass,
@@ -28,7 +29,7 @@ from cconv.data.metadata import (
 from cconv.data.source import SPLITS, STORED, Given, as_tensor, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory, finite_difference_velocities
 from cconv.domain import Box
-from cconv.errors import DataError
+from cconv.errors import CConvError, DataError
 
 FILES = (*(f"{split}.h5" for split in SPLITS), METADATA)
 FRAMES_PER_CHUNK = 8
@@ -101,7 +102,7 @@ class LagrangeBenchSource:
     def _group(self, name: str) -> Iterator[tuple[Path, h5py.Group]]:
         split, _, group = name.partition("/")
         with _opened(self._file_of[split]) as file:
-            yield self._file_of[split], file[group]
+            yield self._file_of[split], linked_member(file, group, self._file_of[split])
 
     def _positions(self, group: h5py.Group, file: Path, name: str) -> h5py.Dataset:
         stored, dim = _member(group, "position", file, name), self.scene.dim
@@ -272,7 +273,8 @@ def _check_complete(folder: Path, files: Iterable[Path]) -> None:
 
 def _trajectory_names(split: str, path: Path) -> tuple[str, ...]:
     with _opened(path) as file:
-        names = tuple(f"{split}/{name}" for name in sorted(file) if isinstance(file[name], h5py.Group))
+        groups = [name for name in sorted(file) if isinstance(linked_member(file, name, path), h5py.Group)]
+        names = tuple(f"{split}/{name}" for name in groups)
     if not names:
         raise DataError(f"{path}: has no trajectory; it must have groups 00000, 00001, ...: write or copy it again.")
     return names
@@ -284,16 +286,21 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError, KeyError) as error:
-        what = "is empty" if path.stat().st_size == 0 else f"is truncated or not HDF5 ({error})"
+    except CConvError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        what = "is empty" if path.stat().st_size == 0 else f"is truncated or not HDF5 ({reason})"
         raise DataError(f"{path}: {what}; copy it again.") from error
 
 
 def _member(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
-    if not isinstance(group.get(key), h5py.Dataset):
-        found = ", ".join(group) or "nothing"
+    stored = linked_member(group, key, file)
+    if not isinstance(stored, h5py.Dataset):
+        found = ", ".join(group)[:200] or "nothing"
         raise DataError(f"{file}: trajectory {name}: `{key}` is missing (found: {found}); write it or copy it again.")
-    return group[key]
+    check_readable(stored, file, f"trajectory {name}", key)
+    return stored
 
 
 def _required(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor:
