@@ -227,7 +227,9 @@ def with_size(sample: Sample) -> SearchSpace:
 
 def importance(sample: Sample, space: SearchSpace, resamples: int) -> dict:
     """f-ANOVA and PED-ANOVA of the sample."""
-    return importance_by_rung(as_records(sample, space), space, [sample.updates], resamples=resamples)[0]
+    return importance_by_rung(
+        as_records(sample, space), space, [sample.updates], resamples=resamples, useless_error=1.0
+    )[0]
 
 
 def departure_from_uniform(search_3: pd.DataFrame) -> dict[str, float]:
@@ -468,7 +470,7 @@ def draw(search_2: pd.DataFrame, search_3: pd.DataFrame, figures: Mapping, out: 
     sample = next(sample for sample in samples(search_2, search_3) if sample.name == "complete")
     records, judged = as_records(sample, sample.space), figures["complete"]["importance"]["f_anova"]["parameters"]
     order = sorted(judged, key=lambda name: -judged[name]["importance"])
-    dependences = [partial_dependence(records, sample.space, sample.updates, name) for name in order]
+    dependences = [partial_dependence(records, sample.space, sample.updates, name, useless_error=1.0) for name in order]
     partial_dependence_chart(dependences).savefig(out / "partial_dependence_search_3.png", dpi=90)
 
 

@@ -73,7 +73,9 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
     enough = [updates for updates, at in errors.items() if len(at) - at.count(None) >= FEWEST_TRIALS]
     if not enough:
         return {}
-    order = ablation_order(known, session.space, baseline, best, enough[-1], session.seed_of(stage))
+    order = ablation_order(
+        known, session.space, baseline, best, enough[-1], session.seed_of(stage), useless_error=session.useless_error
+    )
     configurations = path_configurations(baseline, best, order, session.space)
     return dict(zip([BASELINE, *order], configurations, strict=True))
 

@@ -18,6 +18,8 @@ def ablation_order(
     best: Mapping,
     updates: int,
     seed: int = 0,
+    *,
+    useless_error: float,
 ) -> list[str]:
     """Hyperparameters in which two configurations differ, each time the one that a surrogate says helps most.
 
@@ -34,11 +36,12 @@ def ablation_order(
         best: Configuration at the end.
         updates: Budget at which errors are taken.
         seed: Of the surrogate.
+        useless_error: Error of predicting the mean, up to which errors count.
 
     Raises:
         ConfigError: If fewer than ten trials have these updates.
     """
-    trials, targets = trials_at(records, updates)
+    trials, targets = trials_at(records, updates, useless_error=useless_error)
     if len(trials) < FEWEST_TRIALS:
         raise ConfigError(f"{len(trials)} trials have {updates} updates; a surrogate needs {FEWEST_TRIALS}.")
     axes = axes_of(space)

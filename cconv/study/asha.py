@@ -50,6 +50,22 @@ class RungTable:
             return True
         return error <= np.percentile(before, 100 * self._quantile)
 
+    def passed(self) -> list[dict]:
+        """How many went on from each rung but the last: "updates", "trials" and "passed".
+
+        More than 1 / `reduction_factor` do: the first trial at a rung always goes on, and those soon after it are
+        compared with few others.
+        """
+        return [
+            {
+                "updates": updates,
+                "trials": len(errors),
+                "passed": sum(self.record(trial, updates, error) for trial, error in errors.items()),
+            }
+            for updates, errors in zip(self.rungs[:-1], self._recorded, strict=False)
+            if errors
+        ]
+
     def entries(self) -> list[dict]:
         """One entry a rung: "updates" and "recorded", its errors by trial."""
         return [

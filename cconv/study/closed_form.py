@@ -10,7 +10,7 @@ import random
 import time
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -77,8 +77,8 @@ def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list
 def screen_closed_forms(session: Session, stage: str) -> dict:
     """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
 
-    Half of them are drawn from all layers that the space holds; the others are one change away from those that would
-    become finalists, the cheapest first, until there is no such change left.
+    Half of them are drawn from all layers that the space holds, as many of each basis; the others are proposed from
+    the records of those before.
     """
     settings, problem = session.study.stages[stage], session.problem
     layers = single_layers(session.space, session.study.network, settings.values_per_range)
@@ -86,26 +86,41 @@ def screen_closed_forms(session: Session, stage: str) -> dict:
         [split[place] for place in evenly_spaced(len(split), settings.screening_frames)]
         for split in (problem.train_samples, problem.valid_samples)
     )
-    candidates = _candidates(session, stage, layers, settings.max_candidates)
-    for number, parameters in enumerate(session.progress(candidates, "closed forms")):
-        folder = session.run.trial(trial_name(stage, number))
-        _fit_and_record(session, parameters, samples, folder, stage, session.study.seeds.init, settings.ridge)
+    untried = {layer_id(layer): layer for layer in layers}
+    batch = _draw(layers, (settings.max_candidates + 1) // 2, session.seed_of(stage))
+    number = 0
+    while batch and number < settings.max_candidates:
+        for layer in batch:
+            del untried[layer_id(layer)]
+        affordable = [layer for layer in batch if session.affordable(layer)][: settings.max_candidates - number]
+        for layer in session.progress(affordable, "closed forms"):
+            folder = session.run.trial(trial_name(stage, number))
+            _fit_and_record(session, layer, samples, folder, stage, session.study.seeds.init, settings.ridge)
+            number += 1
+        batch = propose(_winners(session, stage), list(untried.values()))
     return {}
 
 
-def _candidates(session: Session, stage: str, layers: list[dict[str, Value]], count: int) -> Iterator[dict[str, Value]]:
-    """At most `count` layers to fit, one after another; later ones depend on the records of earlier ones."""
-    left = count
-    untried = {layer_id(layer): layer for layer in layers}
-    batch = _draw(layers, (count + 1) // 2, session.seed_of(stage))
-    while batch and left:
-        for layer in batch[:left]:
-            del untried[layer_id(layer)]
-            if session.affordable(layer):
-                left -= 1
-                yield layer
-        batches = (_neighbors(record.parameters, untried.values()) for record in _winners(session, stage)[::-1])
-        batch = next(filter(None, batches), [])
+def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]]) -> list[dict[str, Value]]:
+    """The layers to fit next, given those that would become finalists now; none where nothing near them is left.
+
+    First the winners with every other number of basis functions, which decides more than anything else; then the
+    layers that differ from a winner in one setting. The most accurate winner comes first.
+    """
+    with_other_terms = [
+        other
+        for record in winners
+        for other in _neighbors(record.parameters, untried)
+        if _same_but_terms(record, other)
+    ]
+    if with_other_terms:
+        return list({layer_id(layer): layer for layer in with_other_terms}.values())
+    return next(filter(None, (_neighbors(record.parameters, untried) for record in winners)), [])
+
+
+def _same_but_terms(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
+    """Whether a layer differs from that of a record in the number of its basis functions alone."""
+    return "radial_terms" in layer and record.parameters | {"radial_terms": layer["radial_terms"]} == layer
 
 
 def layer_id(layer: Mapping[str, Value]) -> str:

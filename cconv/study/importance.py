@@ -32,7 +32,13 @@ _DUMMY = Axis("(dummy)", (0.0, 1.0))
 
 
 def importance_by_rung(
-    records: Sequence[TrialRecord], space: "SearchSpace", rungs: Sequence[int], *, seed: int = 0, resamples: int = 50
+    records: Sequence[TrialRecord],
+    space: "SearchSpace",
+    rungs: Sequence[int],
+    *,
+    useless_error: float,
+    seed: int = 0,
+    resamples: int = 50,
 ) -> list[dict]:
     """Importance of every hyperparameter at each rung, from the trials that have an error at exactly that rung.
 
@@ -48,24 +54,29 @@ def importance_by_rung(
         records: Trials of one stage that drew at random.
         space: The space that they were drawn from.
         rungs: Numbers of updates, ascending.
+        useless_error: Error of predicting the mean, up to which errors count.
         seed: Of resamples, dummies and forests.
         resamples: Number of resamples.
 
     Returns:
         One entry a rung with at least ten trials and errors that differ: "updates", "trials"; "censored", whether some
-        trials were stopped before, so that what is left is a selection by error; "clipped", how many count with an
-        error of 1; "surrogate_r2", cross-validated; and for "f_anova" and "ped_anova" their settings, "noise_floor" and
+        trials were stopped before, so that what is left is a selection by error; "clipped", how many count with the
+        useless error; "surrogate_r2", cross-validated; and for "f_anova" and "ped_anova" their settings, "noise_floor" and
         "parameters", which gives "importance", "low", "high", "above_noise" for each. f-ANOVA's are shares of the
         variance, whose rest is interactions; PED-ANOVA's are shares of the sum over all hyperparameters.
     """
     axes = axes_of(space)
     entries = []
     for previous, updates in zip([0, *rungs], rungs, strict=False):
-        trials, targets = trials_at(records, updates, after=previous)
+        trials, targets = trials_at(records, updates, after=previous, useless_error=useless_error)
         if len(trials) >= FEWEST_TRIALS and np.ptp(targets) > 0:
             points = coordinates(axes, [trial.parameters for trial in trials])
             entry = _entry(axes, points, targets, np.random.default_rng([seed, updates]), resamples)
-            entries.append({"updates": updates, "censored": _stopped_by(records, previous), **entry})
+            facts = {
+                "censored": _stopped_by(records, previous),
+                "clipped": int(np.sum(targets == np.log10(useless_error))),
+            }
+            entries.append({"updates": updates, **facts, **entry})
     return entries
 
 
@@ -89,7 +100,6 @@ def _entry(
             judged["above_noise"] = False
     return {
         "trials": len(targets),
-        "clipped": int(np.sum(targets == 0)),
         "surrogate_r2": r2,
         "f_anova": {"trees": _TREES} | f_anova,
         "ped_anova": {"target_quantile": best, "region_quantile": 1.0, "evaluate_on_local": True} | ped_anova,

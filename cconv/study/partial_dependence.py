@@ -15,11 +15,25 @@ if TYPE_CHECKING:  # spaces need torch, which readers of records need not load
 
 
 def partial_dependence(
-    records: Sequence[TrialRecord], space: "SearchSpace", updates: int, parameter: str, *, seed: int = 0
+    records: Sequence[TrialRecord],
+    space: "SearchSpace",
+    updates: int,
+    parameter: str,
+    *,
+    useless_error: float,
+    seed: int = 0,
 ) -> dict:
     """How the error depends on one hyperparameter when the others are as in the trials, by a random forest.
 
     Source: Friedman, "Greedy Function Approximation", Ann. Statist. 29 (2001), section 8.2, on log10 error.
+
+    Args:
+        records: Trials of one stage that drew at random.
+        space: The space that they were drawn from.
+        updates: Number of gradient updates of the errors.
+        parameter: The hyperparameter.
+        useless_error: Error of predicting the mean, up to which errors count.
+        seed: Of the forest.
 
     Returns:
         "parameter", "scale" ("linear", "log" or "choice"), "updates", "trials", "surrogate_r2"; "values", and at each
@@ -30,7 +44,7 @@ def partial_dependence(
     """
     axes = axes_of(space)
     names = [axis.name for axis in axes]
-    trials, targets = trials_at(records, updates)
+    trials, targets = trials_at(records, updates, useless_error=useless_error)
     if parameter not in names:
         raise ConfigError(f"`{parameter}` does not vary in the space; those that do: {', '.join(names)}.")
     if len(trials) < FEWEST_TRIALS:

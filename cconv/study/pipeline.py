@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
 from cconv.errors import ConfigError
+from cconv.evaluation.metrics import mean_predictor_error, normalized_mse
 from cconv.study.ablation import ablate
 from cconv.study.baseline import train_baseline
 from cconv.study.closed_form import screen_closed_forms
@@ -181,4 +182,5 @@ def _session(
             start_pool=start_pool,
             count_cost=count_cost,
             progress=progress,
+            useless_error=normalized_mse(mean_predictor_error(problem.valid_samples, problem.train_samples)),
         )

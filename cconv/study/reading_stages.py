@@ -20,13 +20,16 @@ def refine_space(session: Session, stage: str) -> dict:
 def measure_importance(session: Session, stage: str) -> dict:
     """Importance of every hyperparameter at every rung of the random searches that the stage reads."""
     records, rungs, seed = session.read(stage), session.study.rungs, session.seed_of(stage)
-    importance = importance_by_rung(records, session.space, rungs, seed=seed)
+    importance = importance_by_rung(records, session.space, rungs, seed=seed, useless_error=session.useless_error)
     if not importance:
         return {}
     first = importance[0]  # all trials were measured there, and none had been stopped
     weights = {name: each["importance"] for name, each in first["f_anova"]["parameters"].items()}
     strongest = sorted(weights, key=weights.__getitem__, reverse=True)[:SHOWN]
     dependences = [
-        partial_dependence(records, session.space, first["updates"], parameter, seed=seed) for parameter in strongest
+        partial_dependence(
+            records, session.space, first["updates"], parameter, seed=seed, useless_error=session.useless_error
+        )
+        for parameter in strongest
     ]
     return {"importance": importance, "partial_dependence": dependences}

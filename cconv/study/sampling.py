@@ -84,6 +84,7 @@ def suggest_parameters(
     full_updates: int,
     affordable: Affordable,
     costs: Mapping[str, float],
+    useless_error: float,
 ) -> dict[str, Value]:
     """Configuration number `number` of an adaptive search for error and cost, given what is known of earlier ones.
 
@@ -100,12 +101,13 @@ def suggest_parameters(
         full_updates: Budget of a trial that was never stopped.
         affordable: Whether a configuration is below the space's cap on cost.
         costs: FLOPs per particle of each trial, by id.
+        useless_error: Error of predicting the mean, up to which errors count.
 
     Raises:
         ConfigError: If hardly any configuration is affordable.
     """
     known = [record for record in records if space.holds(record.parameters)]
-    scalarize = _Scalarization.of(known, costs, error_weight(number))
+    scalarize = _Scalarization.of(known, costs, error_weight(number), useless_error)
     distributions = {name: _distribution(parameter) for name, parameter in space.parameters.items()}
     study = _study_in_memory(int(np.random.SeedSequence([seed, number]).generate_state(1)[0]))
     study.add_trials([_as_optuna(record, distributions, full_updates, costs, scalarize) for record in known])
@@ -131,16 +133,19 @@ class _Scalarization:
     log_errors: tuple[float, float]
     log_costs: tuple[float, float]
     error_weight: float
+    useless_error: float  # that of predicting the mean: how much worse a model is does not matter
 
     @classmethod
-    def of(cls, records: Sequence[TrialRecord], costs: Mapping[str, float], error_weight: float) -> "_Scalarization":
-        # An error above 1 is worse than predicting the mean: how much worse does not matter.
-        errors = [min(record.last["valid_normalized_mse"], 1.0) for record in records if record.last is not None]
-        return cls(_log_span(errors), _log_span([costs[record.id] for record in records]), error_weight)
+    def of(
+        cls, records: Sequence[TrialRecord], costs: Mapping[str, float], error_weight: float, useless_error: float
+    ) -> "_Scalarization":
+        known = [record.last["valid_normalized_mse"] for record in records if record.last is not None]
+        of_errors = _log_span([min(error, useless_error) for error in known])
+        return cls(of_errors, _log_span([costs[record.id] for record in records]), error_weight, useless_error)
 
     def __call__(self, error: float, cost: float) -> float:
         terms = (
-            self.error_weight * _position(min(error, 1.0), self.log_errors),
+            self.error_weight * _position(min(error, self.useless_error), self.log_errors),
             (1 - self.error_weight) * _position(cost, self.log_costs),
         )
         return max(terms) + AUGMENTATION * sum(terms)

@@ -50,6 +50,7 @@ def adaptive_search(session: Session, stage: str) -> dict:
             full_updates=study.training.updates,
             affordable=session.affordable,
             costs=costs,
+            useless_error=session.useless_error,
         )
 
     _search(session, stage, jobs(), settings.trials)

@@ -17,6 +17,7 @@ from cconv.evaluation.metrics import mean_predictor_error, normalized_mse
 from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.study.asha import RungFile
 from cconv.study.budget import budget_words
 from cconv.study.costs import points_of_search
 from cconv.study.finalists import (
@@ -76,6 +77,7 @@ def select(session: Session, stage: str) -> dict:
         "analytic": asdict(judged.analytic),
         "growth": growth,
         "trials": _counts(run),
+        "rungs": _passed_rungs(session),
         **found,
         "wall_seconds": _seconds_before(session, stage) + time.perf_counter() - start,
     }
@@ -280,6 +282,13 @@ def _dataset(session: Session, test_samples: Sequence[Sample]) -> dict:
     problem = session.problem
     frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
     return {"path": str(session.dataset.path), "scene": session.dataset.scene.name, "frames": frames}
+
+
+def _passed_rungs(session: Session) -> dict[str, list[dict]]:
+    """How many trials of each search went on from each rung."""
+    study, file = session.study, RungFile(session.run.path / "rungs.json")
+    factor = study.search.reduction_factor
+    return {stage: file.table(stage, study.rungs, factor).passed() for stage in file.read()}
 
 
 def _counts(run: RunFolder) -> dict[str, dict[str, int]]:

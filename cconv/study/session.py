@@ -2,6 +2,9 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
 
 from cconv.data.dataset import Dataset
 from cconv.errors import ConfigError
@@ -31,6 +34,7 @@ class Session:
         start_pool: Gives the `RayPool`; starts it at the first call.
         count_cost: Counts the cost of a configuration, before anything is built.
         progress: Wraps an iterable to show progress, given a label.
+        useless_error: What predicting the training mean scores on the validation split.
     """
 
     study: StudyConfig
@@ -43,6 +47,7 @@ class Session:
     start_pool: Callable
     count_cost: CostCounter
     progress: Progress
+    useless_error: float
 
     def read(self, stage: str, *kinds: str) -> list[TrialRecord]:
         """Records of the stages that a stage reads, of some kinds only if any are named."""
@@ -51,8 +56,8 @@ class Session:
         return [record for name in names for record in self.run.trials_of(name)]
 
     def seed_of(self, stage: str) -> int:
-        """Seed of a stage's draws; no two stages share one."""
-        return self.study.seeds.search + list(self.study.stages).index(stage)
+        """Seed of a stage's draws: streams of stages and studies do not overlap, and no stage shifts another's."""
+        return int(np.random.SeedSequence([self.study.seeds.search, crc32(stage.encode())]).generate_state(1)[0])
 
     def space_of(self, stage: str) -> SearchSpace:
         """The study's space, or the one that an earlier stage refined for this one."""

@@ -14,7 +14,6 @@ from cconv.study.records import TrialRecord
 if TYPE_CHECKING:  # spaces need torch, which who reads records need not load
     from cconv.study.space import Parameter, SearchSpace, Value
 
-USELESS_ERROR = 1.0  # normalised error of predicting the mean
 FEWEST_TRIALS = 10  # fewer say nothing of a dozen hyperparameters
 
 
@@ -88,26 +87,32 @@ def coordinates(axes: Sequence[Axis], parameters: Iterable[Mapping]) -> NDArray[
 
 
 def trials_at(
-    records: Sequence[TrialRecord], updates: int, after: int = 0
+    records: Sequence[TrialRecord], updates: int, after: int = 0, *, useless_error: float
 ) -> tuple[list[TrialRecord], NDArray[np.float64]]:
     """Trials with an error at exactly this number of updates, and log10 of those errors.
 
-    A trial that diverged, or was given up with an error above 1, on the way there, later than `after`, counts too.
-    Errors above 1, and those of such trials, count as 1: a model worse than the mean of the target is useless, and how
-    much worse it is says nothing of good models, yet would make up most of the variance.
+    A trial that diverged, or was given up with a useless error, on the way there, later than `after`, counts too.
+    Errors above the useless one, and those of such trials, count as that: how much worse than predicting the mean a
+    model is says nothing of good models, yet would make up most of the variance.
+
+    Args:
+        records: The trials.
+        updates: Number of gradient updates.
+        after: Updates of the rung before.
+        useless_error: Error of predicting the mean on the validation split; it is 1 on the training split alone.
     """
-    errors = {record.id: _error_at(record, updates, after) for record in records}
+    errors = {record.id: _error_at(record, updates, after, useless_error) for record in records}
     measured = [record for record in records if errors[record.id] is not None]
     values = np.array([errors[record.id] for record in measured], dtype=np.float64)
-    return measured, np.log10(np.clip(values, np.finfo(float).tiny, USELESS_ERROR))
+    return measured, np.log10(np.clip(values, np.finfo(float).tiny, useless_error))
 
 
-def _error_at(record: TrialRecord, updates: int, after: int) -> float | None:
+def _error_at(record: TrialRecord, updates: int, after: int, useless_error: float) -> float | None:
     if record.log and after < record.log[-1]["updates"] <= updates:
         error = record.log[-1]["valid_normalized_mse"]
-        useless = error is None or error > USELESS_ERROR
+        useless = error is None or error > useless_error
         if record.outcome == "diverged" or (record.outcome == "stopped" and useless):
-            return USELESS_ERROR
+            return useless_error
     return record.error_at(updates)
 
 

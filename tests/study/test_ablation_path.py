@@ -54,8 +54,8 @@ def records():
 
 
 def test_what_helps_most_comes_first(records):
-    assert ablation_order(records, SPACE, BASELINE, BEST, 9) == ["basis", "rate", "width"]
-    assert ablation_order(records, SPACE, BASELINE, BEST, 9, seed=5) == ["basis", "rate", "width"]
+    assert ablation_order(records, SPACE, BASELINE, BEST, 9, useless_error=1.0) == ["basis", "rate", "width"]
+    assert ablation_order(records, SPACE, BASELINE, BEST, 9, seed=5, useless_error=1.0) == ["basis", "rate", "width"]
 
 
 @pytest.mark.parametrize("order", [["basis", "rate", "width"], ["width", "basis", "rate"], ["rate", "width", "basis"]])
@@ -80,10 +80,10 @@ def test_what_neither_end_has_is_at_the_baseline_of_the_space_where_it_is_active
 
 
 def test_the_same_configuration_needs_no_change(records):
-    assert ablation_order(records, SPACE, BASELINE, BASELINE, 9) == []
+    assert ablation_order(records, SPACE, BASELINE, BASELINE, 9, useless_error=1.0) == []
     assert path_configurations(BASELINE, BASELINE, [], SPACE) == [BASELINE]
 
 
 def test_too_few_trials_are_refused(records):
     with pytest.raises(ConfigError, match="9 trials have 9 updates; a surrogate needs 10"):
-        ablation_order(records[:9], SPACE, BASELINE, BEST, 9)
+        ablation_order(records[:9], SPACE, BASELINE, BEST, 9, useless_error=1.0)

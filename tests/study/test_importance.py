@@ -58,7 +58,7 @@ def by_word_and_rate(each, updates, rng):
 
 
 def test_shares_of_variance_are_those_of_an_additive_error():
-    entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], resamples=8)[0]
+    entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], resamples=8, useless_error=1.0)[0]
     judged = entry["f_anova"]["parameters"]
     word, rate = 1.5**2 * (1 / 3) * (2 / 3), 0.6**2 * 3**2 / 12
     assert judged["word"]["importance"] == pytest.approx(word / (word + rate), abs=0.07)
@@ -71,7 +71,7 @@ def test_shares_of_variance_are_those_of_an_additive_error():
 
 def test_what_the_best_have_in_common_is_important_by_ped_anova():
     records = trials(200, lambda each, updates, rng: -3 - (each["size"] == 8) + 0.1 * rng.normal())
-    entry = importance_by_rung(records, SPACE, [10], resamples=5)
+    entry = importance_by_rung(records, SPACE, [10], resamples=5, useless_error=1.0)
     judged = entry[0]["ped_anova"]["parameters"]
     assert judged["size"]["importance"] == max(each["importance"] for each in judged.values())
     assert judged["size"]["above_noise"]
@@ -80,7 +80,9 @@ def test_what_the_best_have_in_common_is_important_by_ped_anova():
 
 
 def test_where_nothing_decides_nothing_is_above_noise():
-    entry = importance_by_rung(trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], resamples=20)[0]
+    entry = importance_by_rung(
+        trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], resamples=20, useless_error=1.0
+    )[0]
     assert entry["surrogate_r2"] < 0.1
     assert not any(each["above_noise"] for each in entry["f_anova"]["parameters"].values())
 
@@ -89,18 +91,18 @@ def test_rungs_are_never_mixed():
     records = trials(
         40, lambda each, updates, rng: -2 - (each["size"] == 8 if updates == 10 else each["word"] == "b"), (10, 30)
     )
-    early, late = importance_by_rung(records, SPACE, [10, 30], resamples=4)
+    early, late = importance_by_rung(records, SPACE, [10, 30], resamples=4, useless_error=1.0)
     for entry, name in ((early, "size"), (late, "word")):
         judged = entry["f_anova"]["parameters"]
         assert judged[name]["importance"] > 0.9
-    assert importance_by_rung(records, SPACE, [20]) == []
+    assert importance_by_rung(records, SPACE, [20], useless_error=1.0) == []
 
 
 def test_a_rung_of_survivors_says_so_and_a_rung_of_few_is_left_out():
     records = trials(40, by_word_and_rate, (10, 30, 90))
     stopped = [record(100 + n, drawn(np.random.default_rng(n)), {10: 0.5}, "stopped") for n in range(20)]
     few = [record(200 + n, each.parameters, {120: 0.5}) for n, each in enumerate(records[:9])]
-    entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], resamples=2)
+    entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], resamples=2, useless_error=1.0)
     assert [(entry["updates"], entry["trials"], entry["censored"]) for entry in entries] == [
         (10, 60, False),
         (30, 40, True),
@@ -112,8 +114,8 @@ def test_a_diverged_trial_counts_as_useless_at_the_rung_on_whose_way_it_diverged
     lost = record(2, {}, {10: 0.2, 17: None}, "diverged")
     given_up = record(3, {}, {7: 99.0}, "stopped")
     records = [fine, wild, lost, given_up]
-    assert trials_at(records, 10)[1].tolist() == pytest.approx([-1, 0, math.log10(0.2), 0])
-    reached, targets = trials_at(records, 30, after=10)
+    assert trials_at(records, 10, useless_error=1.0)[1].tolist() == pytest.approx([-1, 0, math.log10(0.2), 0])
+    reached, targets = trials_at(records, 30, after=10, useless_error=1.0)
     assert [each.id for each in reached] == ["r0", "r1", "r2"]
     assert targets.tolist() == pytest.approx([-2, -1, 0])
 
@@ -150,7 +152,7 @@ def test_a_surrogate_of_noise_does_not_predict():
 
 def test_partial_dependence_follows_an_additive_error():
     records = trials(150, by_word_and_rate)
-    found = partial_dependence(records, SPACE, 10, "word")
+    found = partial_dependence(records, SPACE, 10, "word", useless_error=1.0)
     assert found["values"] == ["a", "b", "c"]
     rise = np.log10(found["error"][1]) - np.log10(found["error"][0])
     assert rise == pytest.approx(1.5, abs=0.15)
@@ -158,7 +160,7 @@ def test_partial_dependence_follows_an_additive_error():
         low <= error <= high for low, error, high in zip(found["low"], found["error"], found["high"], strict=True)
     )
     assert len(found["points"]) == found["trials"] == 150
-    by_rate = partial_dependence(records, SPACE, 10, "rate")
+    by_rate = partial_dependence(records, SPACE, 10, "rate", useless_error=1.0)
     slope = np.polyfit(np.log10(by_rate["values"]), np.log10(by_rate["error"]), 1)[0]
     assert slope == pytest.approx(0.6, abs=0.1)
     assert json.loads(json.dumps(by_rate)) == by_rate
@@ -167,6 +169,6 @@ def test_partial_dependence_follows_an_additive_error():
 def test_partial_dependence_refuses_what_it_cannot_show():
     records = trials(12, by_word_and_rate)
     with pytest.raises(ConfigError, match="`only` does not vary in the space; those that do: word, size, rate, count"):
-        partial_dependence(records, SPACE, 10, "only")
+        partial_dependence(records, SPACE, 10, "only", useless_error=1.0)
     with pytest.raises(ConfigError, match="0 trials have 11 updates"):
-        partial_dependence(records, SPACE, 11, "word")
+        partial_dependence(records, SPACE, 11, "word", useless_error=1.0)

@@ -63,7 +63,14 @@ def mixed_records(count=40):
 def suggest(records, number, seed=0, affordable=lambda parameters: True, space=SPACE):
     costs = {record.id: cost_of(record.parameters) for record in records}
     return suggest_parameters(
-        space, records, number=number, seed=seed, full_updates=FULL, affordable=affordable, costs=costs
+        space,
+        records,
+        number=number,
+        seed=seed,
+        full_updates=FULL,
+        affordable=affordable,
+        costs=costs,
+        useless_error=1.0,
     )
 
 
