@@ -96,7 +96,7 @@ def field(dim, boundary_channels, spacing=0.1):
         dim=dim,
         particle_spacing=spacing,
         kernel="cubic_spline",
-        smoothing_length=spacing,
+        relative_smoothing_length=1.0,
         boundary_channels=boundary_channels,
         network=NetworkConfig(layers=1),
     )
@@ -106,7 +106,7 @@ def field(dim, boundary_channels, spacing=0.1):
 @pytest.mark.parametrize("count", [1, 100, 512])
 def test_a_block_is_fluid_of_the_spacing_on_a_wall(count, channels):
     frame, scene = fluid_block(count, field(3, channels))
-    block = make_inputs(fluid_state(frame, scene.box, CubicSpline(0.1, 3)), frame.boundary, scene.box)
+    block = make_inputs(fluid_state(frame, scene.box, CubicSpline(0.1, 3)), frame.boundary, scene)
     assert block.num_particles == len(block.features) == count
     if count == 512:
         neighbors = radius_graph(block.positions, 0.12).row_splits.diff()
