@@ -73,7 +73,9 @@ class ConvNet(nn.Module):
         first, *rest = layer_channels
         self.own_channels = in_channels if own_channels is None else own_channels
         common = {"initialization": initialization, "generator": generator}
-        of_branch = bias and (message == "absolute" or bool(rest))  # branches of layer 0 are side by side if more follow
+        of_branch = bias and (
+            message == "absolute" or bool(rest)
+        )  # branches of layer 0 are side by side if more follow
         of_added = bias and message == "absolute"
         self.boundary_conv = (
             ContinuousConv(boundary_channels, first, kernel_size, dim, bias=of_branch, **common)
