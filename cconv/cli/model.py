@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ import typer
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
-from cconv.errors import CConvError, ConfigError, DataError
+from cconv.errors import CConvError, ConfigError, DataError, shown
 from cconv.validation import check_setting
 
 
@@ -106,39 +107,95 @@ def evaluate(
     task: Annotated[
         str | None, typer.Option(help="Task that the model must be for; an error if it is for another.")
     ] = None,
+    mass: Annotated[float | None, typer.Option(help="Mass of every particle of the data.")] = None,
+    particle_spacing: Annotated[float | None, typer.Option(help="Initial distance of neighbouring particles.")] = None,
+    frame_dt: Annotated[float | None, typer.Option(help="Time between stored frames.")] = None,
+    force: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Constant external acceleration.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Error of a saved model on a split of a data set; by default the test split it was reported on."""
+    """Error of a saved model on a split of a data set; by default the test split it was reported on.
+
+    Models know no units of the data, so that other data may have another resolution. Their masses, spacing and time are
+    their own, or given here; those of the checkpoint are only for the data that it was trained on.
+    """
     from cconv.data.targets import iterate_samples
-    from cconv.evaluation.metrics import frame_errors, normalized_mse, per_frame_normalized_mse
-    from cconv.study.problem import data_from_card, open_study_data
+    from cconv.study.problem import open_card_data
     from cconv.training.checkpoint import load_model, read_card
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
-    dataset = open_study_data(data_from_card(card, data), card.get("data_seed", 0))
-    samples = iterate_samples(dataset, split, model.config.task, model.kernel)
-    frames = frame_errors(model, show_progress(samples, f"evaluate {split}"))
-    mse = normalized_mse(frames)
-    if not math.isfinite(mse):
-        raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
+    given = {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": _numbers(force)}
+    dataset, is_own = open_card_data(card, data, given)
+    kernel = model.kernel_at(dataset.scene.particle_spacing)
+
+    def samples(split: str, verb: str) -> list:
+        label = f"{verb} {split}"
+        return list(show_progress(iterate_samples(dataset, split, model.config.task, kernel), label))
+
+    asked = samples(split, "read")
+    training = samples("train", "read") if is_own and split != "train" else asked if is_own else None
     facts = {
         "checkpoint": str(checkpoint),
         "data": str(dataset.path),
         "task": model.config.task,
         "split": split,
-        "frames": len(frames),
-        "normalized_mse": mse,
-        "relative_rmse": mse**0.5,
-        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
+        "frames": len(asked),
+        **_errors_on(model, show_progress(asked, f"evaluate {split}"), asked, training),
         "num_parameters": model.num_parameters,
+        "particle_spacing": dataset.scene.particle_spacing,
+        "trained_at_particle_spacing": model.config.particle_spacing,
     }
+    if not math.isfinite(facts["normalized_mse"]):
+        raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
     if as_json:
         print_json(facts)
         return
-    results.print(
-        f"{split}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {len(frames)} frames "
-        f"({model.config.task}, {model.num_parameters:,} parameters)"
-    )
+    _print_evaluation(facts)
+
+
+def _errors_on(model, progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
+    """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
+    from cconv.evaluation import metrics
+
+    frames = metrics.frame_errors(model, progress)
+    mse, variance = metrics.normalized_mse(frames), metrics.own_variance(model, samples)
+    mean = None if training is None else metrics.normalized_mse(metrics.mean_predictor_error(samples, training))
+    return {
+        "normalized_mse": mse,
+        "relative_rmse": mse**0.5,
+        "own_normalized_mse": mse / variance if variance > 0 else None,
+        "mean_predictor_normalized_mse": mean,
+        "per_frame_normalized_mse": metrics.per_frame_normalized_mse(frames),
+    }
+
+
+def _print_evaluation(facts: Mapping) -> None:
+    """What `evaluate` says to a reader: the error by both variances where they differ, and what knows nothing."""
+    mse, own, mean = (facts[name] for name in ("normalized_mse", "own_normalized_mse", "mean_predictor_normalized_mse"))
+    lines = [
+        f"{facts['split']}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {facts['frames']} frames "
+        f"({facts['task']}, {facts['num_parameters']:,} parameters)"
+    ]
+    if own is not None and not math.isclose(own, mse, rel_tol=0.005):
+        lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
+    if mean is not None:
+        lines.append(f"Predicting the mean of the training split here: {mean:.4g}")
+    spacing, trained = facts["particle_spacing"], facts["trained_at_particle_spacing"]
+    if not math.isclose(spacing, trained, rel_tol=1e-6):
+        lines.append(f"Particle spacing {spacing:g}; the model was trained at {trained:g}")
+    for line in lines:
+        results.print(line, soft_wrap=True)
+
+
+def _numbers(text: str | None) -> tuple[float, ...] | None:
+    """Numbers between commas.
+
+    Raises:
+        ConfigError: If one is none.
+    """
+    try:
+        return None if text is None else tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--force must be numbers between commas, e.g. 0,-9.81, got {shown(text)}.") from None
 
 
 def report(path: RunPath) -> None:

@@ -1,7 +1,7 @@
 """What a network is given: features of fluid particles and boundary points, and their standardisation.
 
-Networks know no metres, kilograms or seconds: lengths are in particle spacings, masses in those of a spacing's volume at
-rest density, times in intervals of stored frames. So a network holds at every resolution and in all units.
+Networks know no metres, kilograms or seconds: lengths are in particle spacings, densities in rest densities, times in
+intervals of stored frames. So a network holds at every resolution and in all units.
 """
 
 from collections.abc import Iterable
