@@ -9,9 +9,10 @@ from typing import Annotated
 import typer
 
 from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.data import Force, FrameDt, Mass, Spacing, parse_vector
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
-from cconv.errors import CConvError, ConfigError, DataError, shown
+from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import check_setting
 
 
@@ -30,13 +31,13 @@ def train(
     from cconv.study.records import TrialFolder
     from cconv.study.trial import run_trial
 
-    config, problem = _study_and_problem(study, data, settings, out)
+    config, problem, dataset = _study_and_problem(study, data, settings, out)
     folder = TrialFolder(out)
     try:
         with TrainingBar(errors, config.name, config.training.updates) as bar:
             trial = run_trial(
                 problem, {}, config.network, config.training, folder, stage="train", init_seed=config.seeds.init,
-                data_seed=config.seeds.data, provenance=provenance(config), on_update=bar.on_update,
+                data_seed=config.seeds.data, provenance=provenance(config, dataset), on_update=bar.on_update,
             )  # fmt: skip
             entries = list(trial)
     except CConvError:
@@ -76,7 +77,7 @@ def fit(
     from cconv.training.closed_form import solve_closed_form
 
     check_setting(Ridge, ridge, "--ridge")
-    config, problem = _study_and_problem(study, data, settings, out)
+    config, problem, dataset = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.network, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
     error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
@@ -88,7 +89,7 @@ def fit(
         "num_parameters": model.num_parameters,
         "valid_normalized_mse": error,
     }
-    save_model(model, out, card | provenance(config))
+    save_model(model, out, card | provenance(config, dataset))
     results.print(
         f"Validation error {error:.4g} (normalized MSE), {model.num_parameters:,} parameters. Checkpoint: {out}",
         soft_wrap=True,
@@ -107,10 +108,10 @@ def evaluate(
     task: Annotated[
         str | None, typer.Option(help="Task that the model must be for; an error if it is for another.")
     ] = None,
-    mass: Annotated[float | None, typer.Option(help="Mass of every particle of the data.")] = None,
-    particle_spacing: Annotated[float | None, typer.Option(help="Initial distance of neighbouring particles.")] = None,
-    frame_dt: Annotated[float | None, typer.Option(help="Time between stored frames.")] = None,
-    force: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Constant external acceleration.")] = None,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
     """Error of a saved model on a split of a data set; by default the test split it was reported on.
@@ -123,7 +124,7 @@ def evaluate(
     from cconv.training.checkpoint import load_model, read_card
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
-    given = {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": _numbers(force)}
+    given = {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": None if force is None else parse_vector(force)}
     dataset, is_own = open_card_data(card, data, given)
     kernel = model.kernel_at(dataset.scene.particle_spacing)
 
@@ -186,18 +187,6 @@ def _print_evaluation(facts: Mapping) -> None:
         results.print(line, soft_wrap=True)
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
-    """Numbers between commas.
-
-    Raises:
-        ConfigError: If one is none.
-    """
-    try:
-        return None if text is None else tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigError(f"--force must be numbers between commas, e.g. 0,-9.81, got {shown(text)}.") from None
-
-
 def report(path: RunPath) -> None:
     """Write report.html of a run again, also of one that was interrupted."""
     from jinja2 import TemplateError
@@ -223,7 +212,7 @@ def report(path: RunPath) -> None:
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
-    """Settings and samples of a study whose single model goes to `out`, which must not exist yet."""
+    """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
     from cconv.study.config import load_study
     from cconv.study.problem import load_problem, open_study_data, with_data_path
 
@@ -232,5 +221,5 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
         config = with_data_path(config, data)
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
-    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
-    return config, problem
+    dataset = open_study_data(config.data, config.seeds.data)
+    return config, load_problem(config, dataset, show_progress), dataset

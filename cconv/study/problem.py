@@ -114,9 +114,15 @@ def load_problem(
     return replace(problem, train_samples=samples["train"], valid_samples=samples["valid"])
 
 
-def provenance(study: StudyConfig) -> dict:
-    """What a checkpoint's card says of the data, so that its errors can be computed again."""
-    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json")}
+def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
+    """What a checkpoint's card says of the data, so that its errors can be computed again.
+
+    Args:
+        study: The study.
+        dataset: Its data, of which a fingerprint is kept; None where that follows later.
+    """
+    fingerprint = {} if dataset is None else {"data_sha256": dataset.fingerprint()}
+    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json"), **fingerprint}
 
 
 def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None = None) -> tuple[Dataset, bool]:

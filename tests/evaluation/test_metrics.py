@@ -78,3 +78,12 @@ def test_frames_with_a_constant_target_do_not_count_in_the_per_frame_error():
     undefined = FrameError(trajectory="0", frame=0, num_particles=10, normalized_mse=1.0, per_frame_normalized_mse=None)
     assert per_frame_normalized_mse([undefined, error(0.5)]) == 0.5
     assert per_frame_normalized_mse([undefined]) is None
+
+
+def test_an_error_by_the_own_variance_is_1_for_the_own_mean(generator):
+    given = problem(generator)
+    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    calm = [replace(sample, target=0.1 * sample.target + 3.0) for sample in given.valid_samples]
+    targets = torch.cat([sample.target for sample in calm]).double()
+    own_mean = (targets.mean() - targets).square().mean() / float(model.target_scale) ** 2
+    assert own_variance(model, calm) == pytest.approx(float(own_mean), rel=1e-4)
