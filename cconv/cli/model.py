@@ -124,7 +124,12 @@ def evaluate(
     from cconv.training.checkpoint import load_model, read_card
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
-    given = {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": None if force is None else parse_vector(force)}
+    given = {
+        "mass": mass,
+        "particle_spacing": particle_spacing,
+        "frame_dt": frame_dt,
+        "force": None if force is None else parse_vector(force),
+    }
     dataset, is_own = open_card_data(card, data, given)
     kernel = model.kernel_at(dataset.scene.particle_spacing)
 

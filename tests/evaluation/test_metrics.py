@@ -1,4 +1,5 @@
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from cconv.evaluation.metrics import (
     frame_errors,
     mean_predictor_error,
     normalized_mse,
+    own_variance,
     per_frame_normalized_mse,
 )
 from cconv.training.field_model import NetworkConfig
@@ -53,7 +55,7 @@ def test_per_frame_error_divides_by_the_frames_own_variance(generator):
     given = problem(generator)
     model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
     entry = frame_errors(model, given.valid_samples[:1])[0]
-    target = given.valid_samples[0].target
+    target = given.valid_samples[0].target * given.valid_samples[0].target_unit
     physical = (model.predict(given.valid_samples[0].inputs) - target).square().mean() / target.var(correction=0)
     assert entry.per_frame_normalized_mse == pytest.approx(physical.item(), rel=1e-4)
     assert per_frame_normalized_mse([entry]) == entry.per_frame_normalized_mse
