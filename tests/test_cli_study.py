@@ -48,7 +48,13 @@ def test_fit_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
     assert status == 0
     assert "Validation error" in out
     status, out, _ = cconv("evaluate", tmp_path / "one", "--split", "valid", "--json")
-    assert json.loads(out)["normalized_mse"] < 0.05
+    facts = json.loads(out)
+    assert facts["normalized_mse"] < 0.05
+    assert facts["mean_predictor_normalized_mse"] > 10 * facts["normalized_mse"]
+    assert facts["own_normalized_mse"] != facts["normalized_mse"]
+    status, out, _ = cconv("evaluate", tmp_path / "one", "--split", "valid")
+    assert "By the variance of these data instead of the training split's: " in out
+    assert "Predicting the mean of the training split here: " in out
     assert_one_clear_line(cconv(*command), "exists already")
 
 

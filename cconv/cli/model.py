@@ -2,12 +2,14 @@
 
 import math
 import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.data import Force, FrameDt, Mass, Spacing, parse_vector
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
@@ -29,13 +31,13 @@ def train(
     from cconv.study.records import TrialFolder
     from cconv.study.trial import run_trial
 
-    config, problem = _study_and_problem(study, data, settings, out)
+    config, problem, dataset = _study_and_problem(study, data, settings, out)
     folder = TrialFolder(out)
     try:
         with TrainingBar(errors, config.name, config.training.updates) as bar:
             trial = run_trial(
                 problem, {}, config.network, config.training, folder, stage="train", init_seed=config.seeds.init,
-                data_seed=config.seeds.data, provenance=provenance(config), on_update=bar.on_update,
+                data_seed=config.seeds.data, provenance=provenance(config, dataset), on_update=bar.on_update,
             )  # fmt: skip
             entries = list(trial)
     except CConvError:
@@ -75,7 +77,7 @@ def fit(
     from cconv.training.closed_form import solve_closed_form
 
     check_setting(Ridge, ridge, "--ridge")
-    config, problem = _study_and_problem(study, data, settings, out)
+    config, problem, dataset = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.network, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
     error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
@@ -87,7 +89,7 @@ def fit(
         "num_parameters": model.num_parameters,
         "valid_normalized_mse": error,
     }
-    save_model(model, out, card | provenance(config))
+    save_model(model, out, card | provenance(config, dataset))
     results.print(
         f"Validation error {error:.4g} (normalized MSE), {model.num_parameters:,} parameters. Checkpoint: {out}",
         soft_wrap=True,
@@ -106,39 +108,88 @@ def evaluate(
     task: Annotated[
         str | None, typer.Option(help="Task that the model must be for; an error if it is for another.")
     ] = None,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Error of a saved model on a split of a data set; by default the test split it was reported on."""
+    """Error of a saved model on a split of a data set; by default the test split it was reported on.
+
+    Models know no units of the data, so that other data may have another resolution. Their masses, spacing and time are
+    their own, or given here; those of the checkpoint are only for the data that it was trained on.
+    """
     from cconv.data.targets import iterate_samples
-    from cconv.evaluation.metrics import frame_errors, normalized_mse, per_frame_normalized_mse
-    from cconv.study.problem import data_from_card, open_study_data
+    from cconv.study.problem import open_card_data
     from cconv.training.checkpoint import load_model, read_card
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
-    dataset = open_study_data(data_from_card(card, data), card.get("data_seed", 0))
-    samples = iterate_samples(dataset, split, model.config.task, model.kernel)
-    frames = frame_errors(model, show_progress(samples, f"evaluate {split}"))
-    mse = normalized_mse(frames)
-    if not math.isfinite(mse):
-        raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
+    given = {
+        "mass": mass,
+        "particle_spacing": particle_spacing,
+        "frame_dt": frame_dt,
+        "force": None if force is None else parse_vector(force),
+    }
+    dataset, is_own = open_card_data(card, data, given)
+    kernel = model.kernel_at(dataset.scene.particle_spacing)
+
+    def samples(split: str, verb: str) -> list:
+        label = f"{verb} {split}"
+        return list(show_progress(iterate_samples(dataset, split, model.config.task, kernel), label))
+
+    asked = samples(split, "read")
+    training = samples("train", "read") if is_own and split != "train" else asked if is_own else None
     facts = {
         "checkpoint": str(checkpoint),
         "data": str(dataset.path),
         "task": model.config.task,
         "split": split,
-        "frames": len(frames),
-        "normalized_mse": mse,
-        "relative_rmse": mse**0.5,
-        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
+        "frames": len(asked),
+        **_errors_on(model, show_progress(asked, f"evaluate {split}"), asked, training),
         "num_parameters": model.num_parameters,
+        "particle_spacing": dataset.scene.particle_spacing,
+        "trained_at_particle_spacing": model.config.particle_spacing,
     }
+    if not math.isfinite(facts["normalized_mse"]):
+        raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
     if as_json:
         print_json(facts)
         return
-    results.print(
-        f"{split}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {len(frames)} frames "
-        f"({model.config.task}, {model.num_parameters:,} parameters)"
-    )
+    _print_evaluation(facts)
+
+
+def _errors_on(model, progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
+    """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
+    from cconv.evaluation import metrics
+
+    frames = metrics.frame_errors(model, progress)
+    mse, variance = metrics.normalized_mse(frames), metrics.own_variance(model, samples)
+    mean = None if training is None else metrics.normalized_mse(metrics.mean_predictor_error(samples, training))
+    return {
+        "normalized_mse": mse,
+        "relative_rmse": mse**0.5,
+        "own_normalized_mse": mse / variance if variance > 0 else None,
+        "mean_predictor_normalized_mse": mean,
+        "per_frame_normalized_mse": metrics.per_frame_normalized_mse(frames),
+    }
+
+
+def _print_evaluation(facts: Mapping) -> None:
+    """What `evaluate` says to a reader: the error by both variances where they differ, and what knows nothing."""
+    mse, own, mean = (facts[name] for name in ("normalized_mse", "own_normalized_mse", "mean_predictor_normalized_mse"))
+    lines = [
+        f"{facts['split']}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {facts['frames']} frames "
+        f"({facts['task']}, {facts['num_parameters']:,} parameters)"
+    ]
+    if own is not None and not math.isclose(own, mse, rel_tol=0.005):
+        lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
+    if mean is not None:
+        lines.append(f"Predicting the mean of the training split here: {mean:.4g}")
+    spacing, trained = facts["particle_spacing"], facts["trained_at_particle_spacing"]
+    if not math.isclose(spacing, trained, rel_tol=1e-6):
+        lines.append(f"Particle spacing {spacing:g}; the model was trained at {trained:g}")
+    for line in lines:
+        results.print(line, soft_wrap=True)
 
 
 def report(path: RunPath) -> None:
@@ -166,7 +217,7 @@ def report(path: RunPath) -> None:
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
-    """Settings and samples of a study whose single model goes to `out`, which must not exist yet."""
+    """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
     from cconv.study.config import load_study
     from cconv.study.problem import load_problem, open_study_data, with_data_path
 
@@ -175,5 +226,5 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
         config = with_data_path(config, data)
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
-    problem = load_problem(config, open_study_data(config.data, config.seeds.data), show_progress)
-    return config, problem
+    dataset = open_study_data(config.data, config.seeds.data)
+    return config, load_problem(config, dataset, show_progress), dataset

@@ -1,4 +1,8 @@
-"""What a network is given: features of fluid particles and boundary points, and their standardisation."""
+"""What a network is given: features of fluid particles and boundary points, and their standardisation.
+
+Networks know no metres, kilograms or seconds: lengths are in particle spacings, densities in rest densities, times in
+intervals of stored frames. So a network holds at every resolution and in all units.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -6,22 +10,51 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from cconv.data.trajectory import Boundary, Frame, ParticleType
+from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
 from cconv.neighbors import Edges, radius_graph
 from cconv.sph.operators import density
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """The fluid particles of a frame as a network sees them.
+class Units:
+    """What a network's numbers are multiples of, in the units of the data.
 
     Attributes:
-        positions: Fluid positions (N, D), length.
-        features: [1, v, ρ] of each fluid particle, (N, D + 2), or [1, v], (N, D + 1), in the units of the data.
-        boundary_positions: (B, D), or None where the scene has no boundary.
+        length: Particle spacing dx.
+        density: Rest density, mean mass of a fluid particle / dx^D.
+        time: Time between stored frames.
+    """
+
+    length: float
+    density: float
+    time: float
+
+    @property
+    def velocity(self) -> float:
+        """Spacings in a frame's time."""
+        return self.length / self.time
+
+
+def units_of(masses: Tensor, scene: Scene) -> Units:
+    """Units of a frame whose fluid particles have masses (N,)."""
+    mean_mass = float(masses.double().mean()) if len(masses) else 1.0
+    return Units(
+        length=scene.particle_spacing, density=mean_mass / scene.particle_spacing**scene.dim, time=scene.frame_dt
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """The fluid particles of a frame as a network sees them, in `units`.
+
+    Attributes:
+        positions: Fluid positions (N, D), particle spacings.
+        features: [1, v, ρ] of each fluid particle, (N, D + 2), or [1, v], (N, D + 1).
+        boundary_positions: (B, D), particle spacings, or None where the scene has no boundary.
         boundary_features: Normals (B, D), or ones (B, 1) where the data hold none; None without boundary.
-        box: Bounds and periodic axes.
+        box: Bounds and periodic axes, particle spacings.
+        units: What these numbers are multiples of.
     """
 
     positions: Tensor
@@ -29,6 +62,7 @@ class Inputs:
     boundary_positions: Tensor | None
     boundary_features: Tensor | None
     box: Box
+    units: Units
 
     @property
     def num_particles(self) -> int:
@@ -84,24 +118,29 @@ def _fluid_particles(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     return frame.positions[fluid].double(), frame.velocities[fluid].double(), frame.masses[fluid].double()
 
 
-def make_inputs(state: FluidState, boundary: Boundary | None, box: Box) -> Inputs:
+def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene) -> Inputs:
     """Network inputs in float32: features [1, v, ρ] (thesis section 3.1), boundary features = normals."""
-    return _inputs(state.positions, [state.velocities, state.densities[:, None]], boundary, box)
+    units = units_of(state.masses, scene)
+    densities = state.densities[:, None] / units.density
+    return _inputs(state.positions, [state.velocities / units.velocity, densities], boundary, scene.box, units)
 
 
-def inputs_without_density(frame: Frame, box: Box) -> Inputs:
+def inputs_without_density(frame: Frame, scene: Scene) -> Inputs:
     """Network inputs in float32 without density, so that no sum over neighbours is taken: features [1, v]."""
-    positions, velocities, _ = _fluid_particles(frame)
-    return _inputs(positions, [velocities], frame.boundary, box)
+    positions, velocities, masses = _fluid_particles(frame)
+    units = units_of(masses, scene)
+    return _inputs(positions, [velocities / units.velocity], frame.boundary, scene.box, units)
 
 
-def _inputs(positions: Tensor, features: list[Tensor], boundary: Boundary | None, box: Box) -> Inputs:
+def _inputs(positions: Tensor, features: list[Tensor], boundary: Boundary | None, box: Box, units: Units) -> Inputs:
+    corners = ([bound / units.length for bound in bounds] for bounds in (box.lower, box.upper))
     return Inputs(
-        positions=positions.float(),
+        positions=(positions / units.length).float(),
         features=torch.cat([torch.ones_like(positions[:, :1]), *features], dim=1).float(),
-        boundary_positions=None if boundary is None else boundary.positions.float(),
+        boundary_positions=None if boundary is None else (boundary.positions.double() / units.length).float(),
         boundary_features=None if boundary is None else _boundary_features(boundary),
-        box=box,
+        box=Box(*corners, box.periodic),
+        units=units,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
-from cconv.data.features import FluidState, Inputs, fluid_state, make_inputs
+from cconv.data.features import FluidState, Inputs, Units, fluid_state, make_inputs
 from cconv.data.trajectory import Frame, Scene
 from cconv.errors import check_choice
 from cconv.sph.operators import density_gradient, density_rate
@@ -30,6 +30,11 @@ def target_channels(task: str, dim: int) -> int:
     return dim if task in VECTOR_TASKS else 1
 
 
+def target_unit(task: str, units: Units) -> float:
+    """Unit of a task's target: rest density a time for D2, rest density a spacing for D3."""
+    return units.density / (units.length if task in VECTOR_TASKS else units.time)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sample:
     """One frame to learn from.
@@ -38,13 +43,15 @@ class Sample:
         trajectory: Name of its trajectory.
         frame: Index of the frame in the stored trajectory.
         inputs: What the network is given.
-        target: Analytic field (N, C) at the fluid particles, float32, in the units of the data.
+        target: Analytic field (N, C) at the fluid particles, float32, in `target_unit`, as networks predict it.
+        target_unit: What it is a multiple of, in the units of the data.
     """
 
     trajectory: str
     frame: int
     inputs: Inputs
     target: Tensor
+    target_unit: float
 
 
 def make_sample(frame: Frame, scene: Scene, task: str, kernel, trajectory: str = "", index: int = 0) -> Sample:
@@ -65,11 +72,14 @@ def make_sample(frame: Frame, scene: Scene, task: str, kernel, trajectory: str =
     """
     check_choice("task", task, TASKS)
     state = fluid_state(frame, scene.box, kernel)
+    inputs = make_inputs(state, frame.boundary, scene)
+    unit = target_unit(task, inputs.units)
     return Sample(
         trajectory=trajectory,
         frame=index,
-        inputs=make_inputs(state, frame.boundary, scene.box),
-        target=TASKS[task](state, kernel).float(),
+        inputs=inputs,
+        target=(TASKS[task](state, kernel) / unit).float(),
+        target_unit=unit,
     )
 
 

@@ -129,7 +129,7 @@ def measure_costs(
             turns_ms=_turns(times[name]),
             us_per_particle=1e3 * medians["ms_per_frame"] / max(particles, 1),
             peak_mb=_peak_megabytes(load, models[name], frames[0], scene, threads),
-            flops_per_particle=flops_per_particle(model, inputs_without_density(frames[0], scene.box)),
+            flops_per_particle=flops_per_particle(model, inputs_without_density(frames[0], scene)),
             threads=threads,
             num_particles=particles,
         )
@@ -268,17 +268,17 @@ def flops_per_particle(model: FieldModel, inputs: Inputs) -> float:
         dim=config.dim,
         vector_output=config.task in VECTOR_TASKS,
         boundary_channels=config.boundary_channels,
-        surroundings=surroundings_of(inputs, config.network.relative_cutoff, config.particle_spacing),
+        surroundings=surroundings_of(inputs, config.network.relative_cutoff),
     ).flops_per_particle
 
 
-def surroundings_of(inputs: Inputs, relative_cutoff: float, particle_spacing: float) -> Surroundings:
+def surroundings_of(inputs: Inputs, relative_cutoff: float) -> Surroundings:
     """Points around the particles of a frame, counted within a cutoff in particle spacings."""
-    cutoff, particles = relative_cutoff * particle_spacing, max(inputs.num_particles, 1)
-    counts = [len(radius_graph(inputs.positions, cutoff, inputs.box)) / particles]
+    particles = max(inputs.num_particles, 1)
+    counts = [len(radius_graph(inputs.positions, relative_cutoff, inputs.box)) / particles]
     if inputs.boundary_positions is not None:
         walls = inputs.boundary_positions
-        pairs = radius_graph(walls, cutoff, inputs.box, queries=inputs.positions)
+        pairs = radius_graph(walls, relative_cutoff, inputs.box, queries=inputs.positions)
         counts += [len(pairs) / particles, len(walls) / particles]
     return Surroundings.counted(relative_cutoff, inputs.positions.shape[1], *counts)
 
@@ -312,7 +312,7 @@ def _block_call(model: FieldModel, size: int) -> Call:
 
 def _analytic_block_call(field: FieldConfig, size: int) -> Call:
     frame, scene = fluid_block(size, field)
-    kernel = kernel_named(field.kernel)(field.smoothing_length, field.dim)
+    kernel = kernel_named(field.kernel)(field.relative_smoothing_length * field.particle_spacing, field.dim)
     return _analytic_call(field.task, kernel, [frame], scene)
 
 
@@ -324,7 +324,7 @@ def _time_prediction(model: FieldModel, frame: Frame, scene: Scene) -> tuple[flo
         model.network.register_forward_hook(lambda *_: marks.append(time.perf_counter())),
     ]
     start = time.perf_counter()
-    model.predict_frame(frame, scene.box)
+    model.predict_frame(frame, scene)
     total = time.perf_counter() - start
     for hook in hooks:
         hook.remove()
@@ -386,7 +386,7 @@ def _memory_of_predictions(
     model = load(path)
     before = _peak_resident_megabytes()
     for _ in range(2):
-        model.predict_frame(frame, scene.box)
+        model.predict_frame(frame, scene)
     return _peak_resident_megabytes() - before
 
 

@@ -123,15 +123,25 @@ def _hidden_widths(network: Mapping[str, Any]) -> list[int]:
     return [network["first_channels"], *[hidden] * (layers - 2)] if layers > 1 else []
 
 
+def _own_channels(network: Mapping[str, Any], vector_output: bool) -> Channels:
+    """Scalars and vectors of a particle itself that the first layer takes, beside a constant."""
+    if network["message"] != "difference":
+        return int(network["density"]), 1
+    return int(network["density"] and vector_output), 0
+
+
 def _grid_layers(
     network: Mapping[str, Any], dim: int, vector_output: bool, boundary_channels: int, fluid: _Pairs, boundary: _Pairs
 ) -> tuple[list[_Conv], list[tuple[Channels, Channels]]]:
     """Convolutions and fully connected layers of a `ConvNet`."""
     first, *rest = [*_hidden_widths(network), dim if vector_output else 1]
-    branches = 3 if boundary_channels else 2
-    pairs = [(dim + 1 + network["density"], first), *pairwise([branches * first, *rest])]
-    dense = [((before, 0), (after, 0)) for before, after in pairs]
-    convs = [(before, after, fluid) for before, after in dense]
+    differences = network["message"] == "difference"
+    features = dim + 1 + network["density"] - differences
+    own = _own_channels(network, vector_output)[0] if differences else features
+    following = pairwise([(1 + bool(boundary_channels) + bool(own)) * first, *rest])
+    hidden = [((before, 0), (after, 0)) for before, after in following]
+    dense = [*([((own, 0), (first, 0))] if own else []), *hidden]
+    convs = [(before, after, fluid) for before, after in [((features, 0), (first, 0)), *hidden]]
     if boundary_channels:
         convs.append(((boundary_channels, 0), (first, 0), boundary))
     return convs, dense
@@ -142,10 +152,11 @@ def _radial_layers(
 ) -> tuple[list[_Conv], list[tuple[Channels, Channels]]]:
     """Convolutions and linear maps of a `RadialNet`; each vector of a hidden layer has a scalar for its gate."""
     hidden = [(width, width) for width in _hidden_widths(network)]
-    inputs = [(1 + network["density"], 1), *hidden]
+    own = _own_channels(network, vector_output)
+    inputs = [(1 + network["density"] - (network["message"] == "difference"), 1), *hidden]
     outputs = [*((scalars + vectors, vectors) for scalars, vectors in hidden), (0, 1) if vector_output else (1, 0)]
-    dense = list(zip(inputs, outputs, strict=True))
-    convs = [(before, after, fluid) for before, after in dense]
+    dense = [(before, after) for before, after in zip([own, *hidden], outputs, strict=True) if any(before)]
+    convs = [(before, after, fluid) for before, after in zip(inputs, outputs, strict=True)]
     if boundary_channels:
         convs.append(((0, 1) if boundary_channels == dim else (boundary_channels, 0), outputs[0], boundary))
     return convs, dense

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cconv.data.features import FluidState, Inputs
+from cconv.data.features import FluidState, Inputs, Units
 from cconv.data.targets import TASKS, VECTOR_TASKS, Sample
 from cconv.domain import Box
 from cconv.neighbors import radius_graph
@@ -40,14 +40,14 @@ def explain(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
         "task"; "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
         "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns.
     """
-    prediction = model.predict(sample.inputs)
+    spacing = sample.inputs.units.length
     return {
         "task": np.array(model.config.task),
-        "particle_spacing": np.array(model.config.particle_spacing),
-        "positions": sample.inputs.positions.numpy(),
-        "target": sample.target.numpy(),
-        "prediction": prediction.numpy(),
-        "error": _relative_errors(model, sample, prediction).square().numpy(),
+        "particle_spacing": np.array(spacing),
+        "positions": (sample.inputs.positions * spacing).numpy(),
+        "target": (sample.target * sample.target_unit).numpy(),
+        "prediction": model.predict(sample.inputs).numpy(),
+        "error": _relative_errors(model, sample).square().numpy(),
         **first_layer_filters(model, sample),
     }
 
@@ -63,7 +63,7 @@ def error_distribution(model: FieldModel, samples: Iterable[Sample]) -> dict[str
         "error_bins" (B + 1,), logarithmic; "error_counts" (B,), particles in each, the first and last bin hold all that
         lie beyond; "error_levels" and "error_quantiles", the quantiles of these levels.
     """
-    errors = torch.cat([_relative_errors(model, sample, model.predict(sample.inputs)) for sample in samples]).numpy()
+    errors = torch.cat([_relative_errors(model, sample) for sample in samples]).numpy()
     bins = np.logspace(-8, 3, 11 * _BINS_PER_DECADE + 1)
     finite = np.nan_to_num(errors, nan=np.inf, posinf=np.inf)
     counts, _ = np.histogram(finite.clip(bins[0], bins[-1]), bins)
@@ -94,16 +94,20 @@ def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarr
     analytic = _analytic_filters(model, sample, pairs)
     learned = _learned_filters(model, sample, pairs)
     learned = learned @ _combination(learned[pairs.ball], analytic[pairs.ball], pairs.volume, model)
+    unexplained = _unexplained(learned[pairs.ball], analytic[pairs.ball], pairs.volume)
+    per_feature = _filter_units(sample, model.config.dim)
+    learned, analytic = learned * per_feature, analytic * per_feature
     profile = _along_direction(learned, pairs, model.config.task)
+    length = sample.inputs.units.length
     results = {
         "is_combined": torch.tensor(len(model.network.convs) > 1),
-        "unexplained": _unexplained(learned[pairs.ball], analytic[pairs.ball], pairs.volume),
-        "cutoff": torch.tensor(model.cutoff),
-        "support": torch.tensor(model.kernel.support_radius),
-        "line": pairs.line,
+        "unexplained": unexplained,
+        "cutoff": torch.tensor(length * model.config.network.relative_cutoff),
+        "support": torch.tensor(length * model.kernel_at(1.0).support_radius),
+        "line": length * pairs.line,
         "learned_on_axes": _on_axes(learned, pairs),
         "analytic_on_axes": _on_axes(analytic, pairs),
-        "radii": pairs.radii,
+        "radii": length * pairs.radii,
         "learned_radial": profile.mean(dim=1),
         "learned_radial_low": profile.quantile(0.05, dim=1),
         "learned_radial_high": profile.quantile(0.95, dim=1),
@@ -115,7 +119,7 @@ def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarr
 
 @dataclass(frozen=True, kw_only=True)
 class _Pairs:
-    """Displacements d = x_j - x_i at which filters are probed: first along each axis, then over a ball.
+    """Displacements d = x_j - x_i at which filters are probed, in particle spacings: along each axis, then over a ball.
 
     Attributes:
         displacements: (P, D).
@@ -142,7 +146,8 @@ class _Pairs:
 
 
 def _probing_pairs(model: FieldModel) -> _Pairs:
-    dim, reach = model.config.dim, max(model.cutoff, model.kernel.support_radius)
+    dim = model.config.dim
+    reach = max(model.config.network.relative_cutoff, model.kernel_at(1.0).support_radius)
     line = torch.linspace(-reach, reach, _POINTS_ON_LINE, dtype=torch.float64)
     on_axes = torch.cat([line[:, None] * axis for axis in torch.eye(dim, dtype=torch.float64)])
     radii = reach * (torch.arange(_RADII, dtype=torch.float64) + 0.5) / _RADII
@@ -177,11 +182,11 @@ def _learned_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor
     network = model.config.network.model_copy(update={"normalize": False})
     twin.config = model.config.model_copy(update={"network": network})
     rest = sample.inputs.features.double().mean(dim=0).expand(2 * len(pairs.displacements), -1)
-    inputs = _isolated_inputs(pairs, rest, model.config.boundary_channels)
-    geometry = twin.geometry(inputs)
+    channels, units = model.config.boundary_channels, sample.inputs.units
+    geometry = twin.geometry(_isolated_inputs(pairs, rest, channels, units))
 
     def answer(features: Tensor) -> Tensor:
-        values = twin.network_inputs(_isolated_inputs(pairs, features, model.config.boundary_channels), geometry)[0]
+        values = twin.network_inputs(_isolated_inputs(pairs, features, channels, units), geometry)[0]
         return twin.network.convs[0](values, geometry.fluid)[: len(pairs.displacements)]
 
     answers = [answer(raised) - answer(rest) for raised in _raised(rest)]
@@ -190,7 +195,7 @@ def _learned_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor
 
 def _analytic_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor:
     """Answers of the analytic operator (P, F, C), by unit of each feature, for the frame's mass and mean density."""
-    inputs, kernel = sample.inputs.double(), model.kernel
+    inputs, kernel = sample.inputs.double(), model.kernel_at(1.0)
     densities = inputs.features[:, -1]
     edges = radius_graph(inputs.positions, kernel.support_radius, inputs.box)
     mass = (densities / density(torch.ones_like(densities), edges, kernel)).mean()
@@ -219,7 +224,13 @@ def _raised(rest: Tensor) -> list[Tensor]:
     return [rest + senders[:, None] * unit for unit in units]
 
 
-def _isolated_inputs(pairs: _Pairs, features: Tensor, boundary_channels: int) -> Inputs:
+def _filter_units(sample: Sample, dim: int) -> Tensor:
+    """What filters of each feature [1, v, ρ] are multiples of, in the units of the data, (F, 1)."""
+    units = sample.inputs.units
+    return (sample.target_unit / torch.tensor([1.0, *[units.velocity] * dim, units.density]).double())[:, None]
+
+
+def _isolated_inputs(pairs: _Pairs, features: Tensor, boundary_channels: int, units: Units) -> Inputs:
     positions = pairs.positions
     dim = positions.shape[1]
     return Inputs(
@@ -228,12 +239,14 @@ def _isolated_inputs(pairs: _Pairs, features: Tensor, boundary_channels: int) ->
         boundary_positions=positions.new_zeros(0, dim) if boundary_channels else None,
         boundary_features=positions.new_zeros(0, boundary_channels) if boundary_channels else None,
         box=Box([0.0] * dim, [1.0] * dim),
+        units=units,
     )
 
 
 def _mean_window_sum(model: FieldModel, sample: Sample) -> Tensor:
     """Mean over particles of ψ, by which normalised filters are divided."""
-    edges = radius_graph(sample.inputs.positions.double(), model.cutoff, sample.inputs.box)
+    cutoff = model.config.network.relative_cutoff
+    edges = radius_graph(sample.inputs.positions.double(), cutoff, sample.inputs.box)
     values = window_values((edges.distances / edges.cutoff) ** 2, model.config.network.window)
     return values.sum() / edges.num_receivers
 
@@ -271,6 +284,7 @@ def _along_direction(filters: Tensor, pairs: _Pairs, task: str) -> Tensor:
     return (vectors * directions).sum(dim=1).unflatten(0, (len(pairs.radii), -1))
 
 
-def _relative_errors(model: FieldModel, sample: Sample, prediction: Tensor) -> Tensor:
+def _relative_errors(model: FieldModel, sample: Sample) -> Tensor:
     """Root mean square of each particle's error over the components, by the standard deviation of the target, (N,)."""
-    return ((prediction - sample.target) / model.target_scale).double().square().mean(dim=1).sqrt()
+    prediction = model(sample.inputs, model.geometry(sample.inputs))
+    return (prediction - model.standardize_target(sample.target)).double().square().mean(dim=1).sqrt()

@@ -85,6 +85,15 @@ def normalized_mse(errors: Sequence[FrameError]) -> float:
     return float(np.average([error.normalized_mse for error in errors], weights=weights))
 
 
+def own_variance(model, samples: Iterable[Sample]) -> float:
+    """Variance of the target over samples / that over the training split of a `FieldModel`.
+
+    An error divided by it is one by the variance of these samples: 1 is predicting their own mean.
+    """
+    targets = standardize_vectors(model.standardize_target(sample.target) for sample in samples)
+    return float(targets.scale[0] ** 2)
+
+
 def per_frame_normalized_mse(errors: Sequence[FrameError]) -> float | None:
     """Mean over frames of the error z-scored by each frame's own target; only to compare with the thesis.
 

@@ -15,7 +15,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from cconv.data.features import fluid_state, make_inputs
 from cconv.data.trajectory import Frame, Scene
 from cconv.evaluation.probes import Probe, Probes, Rollout
 from cconv.training.field_model import FieldModel
@@ -47,12 +46,11 @@ class ModelPredictor:
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
         """Field (N, C) in the units of the data, as `FieldModel.predict_frame`."""
-        return self._model.predict_frame(frame, scene.box)
+        return self._model.predict_frame(frame, scene)
 
     def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
         """The same with weights and inputs in float64."""
-        inputs = make_inputs(fluid_state(frame, scene.box, self._model.kernel), frame.boundary, scene.box)
-        return self._exact.predict(inputs.double())
+        return self._exact.predict(self._model.inputs(frame, scene).double())
 
 
 @dataclass(frozen=True, kw_only=True)

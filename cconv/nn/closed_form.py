@@ -60,9 +60,11 @@ class GridLayer:
         boundary_features: Tensor | None = None,
         boundary_geometry: ConvGeometry | None = None,
     ) -> list[Tensor]:
-        """Terms (N, P): columns of the boundary and the fluid, features, one."""
+        """Terms (N, P): columns of the boundary and the fluid, a particle's own features, one; those that there are."""
         own = MESSAGES[self.network.convs[0].message]
-        parts = [columns(features, geometry.reads, own), features, torch.ones_like(features[:, :1])]
+        parts = [columns(features, geometry.reads, own), self.network.own(features)]
+        if self._bias is not None:
+            parts.append(torch.ones_like(features[:, :1]))
         if boundary_features is not None:
             parts.insert(0, columns(boundary_features, boundary_geometry.reads))
         return [torch.cat(parts, dim=1)]
@@ -74,14 +76,20 @@ class GridLayer:
     @torch.no_grad()
     def assign(self, coefficients: Sequence[Tensor]) -> None:
         """Make coefficients (P, C) those of the network."""
-        network = self.network
         (values,) = coefficients
-        weights = [network.convs[0].filters, network.dense[0].weight.T]
-        if network.boundary_conv is not None:
-            weights.insert(0, network.boundary_conv.filters)
-            network.boundary_conv.bias.zero_()
-        network.convs[0].bias.zero_()
-        _assign([*weights, network.dense[0].bias[None]], values)
+        convs = [conv for conv in (self.network.boundary_conv, self.network.convs[0]) if conv is not None]
+        weights = [conv.filters for conv in convs]
+        if self.network.own_dense is not None:
+            weights.append(self.network.own_dense.weight.T)
+        for bias in (conv.bias for conv in convs if conv.bias is not None):
+            bias.zero_()
+        _assign([*weights, *([] if self._bias is None else [self._bias[None]])], values)
+
+    @property
+    def _bias(self) -> Tensor | None:
+        """The bias that is fitted; convolutions with another of their own keep 0."""
+        dense = self.network.own_dense
+        return None if dense is None else dense.bias
 
 
 class RadialLayer:
@@ -102,8 +110,10 @@ class RadialLayer:
         if boundary_features is not None:
             convolved.insert(0, (self.network.boundary_conv, boundary_features, boundary_geometry))
         gathered = [_radial_columns(*inputs) for inputs in convolved]
-        scalars, vectors = split_kinds(features, self.network.convs[0].in_channels, self.network.dim)
-        of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars, torch.ones_like(features[:, :1])]
+        scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
+        of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
+        if self.network.own_dense is not None and self.network.own_dense.bias is not None:
+            of_scalars.append(torch.ones_like(features[:, :1]))
         of_vectors = [*(to_vectors for _, to_vectors in gathered), vectors.transpose(1, 2).flatten(0, 1)]
         terms = [torch.cat(of_scalars, dim=1), torch.cat(of_vectors, dim=1)]
         return [values for values, count in zip(terms, self._out_channels, strict=True) if count]
@@ -117,12 +127,12 @@ class RadialLayer:
     @torch.no_grad()
     def assign(self, coefficients: Sequence[Tensor]) -> None:
         """Make coefficients (P, S) and (P', V) those of the network."""
-        network, dense = self.network, self.network.dense[0]
+        network, dense = self.network, self.network.own_dense
         convs = [conv for conv in (network.boundary_conv, network.convs[0]) if conv is not None]
-        weights = [
-            [*(conv.scalar_filters for conv in convs), dense.scalar_weights, dense.bias[None]],
-            [*(conv.vector_filters for conv in convs), dense.vector_weights],
-        ]
+        weights = [[conv.scalar_filters for conv in convs], [conv.vector_filters for conv in convs]]
+        if dense is not None:
+            weights[0] += [dense.scalar_weights, *([] if dense.bias is None else [dense.bias[None]])]
+            weights[1] += [dense.vector_weights]
         present = [kind for kind, count in zip(weights, self._out_channels, strict=True) if count]
         for tensors, values in zip(present, coefficients, strict=True):
             _assign(tensors, values)

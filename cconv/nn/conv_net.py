@@ -24,6 +24,9 @@ class ConvNet(nn.Module):
     where the widths of z_k and z_{k-1} agree, z_{k-1} is added too. A network of one layer adds its branches instead
     of concatenating them. The last layer has no activation.
 
+    With absolute messages every convolution and every fully connected layer has a bias, as published. With differences
+    only one of two that are added has.
+
     Args:
         in_channels: Features of a fluid particle.
         layer_channels: Outputs of each layer, the last one the network's.
@@ -36,6 +39,9 @@ class ConvNet(nn.Module):
             (the thesis's code) or "none".
         initialization: "xavier_uniform" with zero biases; "open3d": convolutions uniform in ±0.05; "thesis": weights of
             fully connected layers zero, as the text of thesis section 4.1 says.
+        own_channels: How many features, the last ones, layer 0's fully connected layer takes; None for all. Without any
+            there is no such layer.
+        bias: Whether there are biases; without them equal features give 0 by differences.
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
@@ -54,6 +60,8 @@ class ConvNet(nn.Module):
         message: str = "absolute",
         skip: str = "before_activation",
         initialization: str = "xavier_uniform",
+        own_channels: int | None = None,
+        bias: bool = True,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
@@ -63,19 +71,38 @@ class ConvNet(nn.Module):
             raise ConfigError("`layer_channels` must name at least one layer, got none.")
         self.activation, self.skip = activation, skip
         first, *rest = layer_channels
+        self.own_channels = in_channels if own_channels is None else own_channels
         common = {"initialization": initialization, "generator": generator}
+        of_branch = bias and (
+            message == "absolute" or bool(rest)
+        )  # branches of layer 0 are side by side if more follow
+        of_added = bias and message == "absolute"
         self.boundary_conv = (
-            ContinuousConv(boundary_channels, first, kernel_size, dim, **common) if boundary_channels else None
+            ContinuousConv(boundary_channels, first, kernel_size, dim, bias=of_branch, **common)
+            if boundary_channels
+            else None
         )
-        branches = 3 if boundary_channels else 2
-        widths = [branches * first, *rest]
+        widths = [(1 + bool(boundary_channels) + bool(self.own_channels)) * first, *rest]
         self.convs = nn.ModuleList(
-            ContinuousConv(inputs, outputs, kernel_size, dim, message=message, **common)
-            for inputs, outputs in [(in_channels, first), *pairwise(widths)]
+            ContinuousConv(inputs, outputs, kernel_size, dim, bias=has_bias, message=message, **common)
+            for inputs, outputs, has_bias in [
+                (in_channels, first, of_branch),
+                *((*both, of_added) for both in pairwise(widths)),
+            ]
         )
+        of_first = [(self.own_channels, first)] if self.own_channels else []
         self.dense = nn.ModuleList(
-            _linear(inputs, outputs, **common) for inputs, outputs in [(in_channels, first), *pairwise(widths)]
+            _linear(inputs, outputs, bias=bias, **common) for inputs, outputs in [*of_first, *pairwise(widths)]
         )
+
+    @property
+    def own_dense(self) -> nn.Linear | None:
+        """Fully connected layer of layer 0, if there is one."""
+        return self.dense[0] if self.own_channels else None
+
+    def own(self, features: Tensor) -> Tensor:
+        """What that layer takes of features (N, C_in)."""
+        return features[:, features.shape[1] - self.own_channels :]
 
     def forward(
         self,
@@ -98,7 +125,9 @@ class ConvNet(nn.Module):
         Raises:
             ShapeError: If boundary inputs are missing, or come without a boundary branch.
         """
-        branches = [self.convs[0](features, geometry), self.dense[0](features)]
+        branches = [self.convs[0](features, geometry)]
+        if self.own_dense is not None:
+            branches.append(self.own_dense(self.own(features)))
         if (self.boundary_conv is None) != (boundary_features is None or boundary_geometry is None):
             raise ShapeError(
                 "`boundary_features` and `boundary_geometry` must be given exactly when the network has a boundary "
@@ -107,7 +136,7 @@ class ConvNet(nn.Module):
         if self.boundary_conv is not None:
             branches.insert(0, self.boundary_conv(boundary_features, boundary_geometry))
         output = torch.cat(branches, dim=1) if len(self.convs) > 1 else sum(branches)
-        for conv, dense in zip(self.convs[1:], self.dense[1:], strict=True):
+        for conv, dense in zip(self.convs[1:], self.dense[bool(self.own_channels) :], strict=True):
             output = self._layer(output, conv, dense, geometry)
         return output
 
@@ -119,9 +148,12 @@ class ConvNet(nn.Module):
         return output + (previous if self.skip == "before_activation" else activated)
 
 
-def _linear(inputs: int, outputs: int, initialization: str, generator: torch.Generator | None) -> nn.Linear:
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    nn.init.zeros_(layer.bias)
+def _linear(
+    inputs: int, outputs: int, *, bias: bool, initialization: str, generator: torch.Generator | None
+) -> nn.Linear:
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
+    if bias:
+        nn.init.zeros_(layer.bias)
     if initialization == "thesis":
         nn.init.zeros_(layer.weight)
     else:

@@ -9,23 +9,29 @@ from cconv.nn.radial_conv import Channels, RadialConv, RadialGeometry, join_kind
 
 
 class VectorLinear(nn.Module):
-    """Linear map of scalars to scalars and of vectors to vectors; scalars alone have a bias, 0 at first.
+    """Linear map of scalars to scalars and of vectors to vectors; scalars alone can have a bias, 0 at first.
 
     Args:
         in_channels: Scalars and vectors of the input (N, S + V · D).
         out_channels: Scalars and vectors of the output.
         dim: Number of space dimensions D.
+        bias: Whether scalars have a bias.
         generator: Source of the initial weights (Xavier-uniform); None for torch's global one.
     """
 
     def __init__(
-        self, in_channels: Channels, out_channels: Channels, dim: int, generator: torch.Generator | None = None
+        self,
+        in_channels: Channels,
+        out_channels: Channels,
+        dim: int,
+        bias: bool = True,
+        generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.in_channels, self.dim = in_channels, dim
         self.scalar_weights = nn.Parameter(torch.zeros(in_channels[0], out_channels[0]))
         self.vector_weights = nn.Parameter(torch.zeros(in_channels[1], out_channels[1]))
-        self.bias = nn.Parameter(torch.zeros(out_channels[0]))
+        self.bias = nn.Parameter(torch.zeros(out_channels[0])) if bias else None
         for weights in (self.scalar_weights, self.vector_weights):
             if weights.numel():
                 nn.init.xavier_uniform_(weights, generator=generator)
@@ -34,7 +40,8 @@ class VectorLinear(nn.Module):
         """Values (N, S_in + V_in · D) to (N, S_out + V_out · D)."""
         scalars, vectors = split_kinds(values, self.in_channels, self.dim)
         mapped = torch.einsum("nvd,vw->nwd", vectors, self.vector_weights)
-        return join_kinds(scalars @ self.scalar_weights + self.bias, mapped)
+        linear = scalars @ self.scalar_weights
+        return join_kinds(linear if self.bias is None else linear + self.bias, mapped)
 
 
 class RadialNet(nn.Module):
@@ -53,6 +60,9 @@ class RadialNet(nn.Module):
         activation: "relu", "gelu", "tanh" or "leaky_relu", of scalars.
         message: "absolute" or "difference", of all fluid convolutions.
         residual: Whether outputs of layers of equal width are added up.
+        own_channels: How many scalars, the last ones, and vectors the first layer's linear map takes; None for all.
+            Without any there is no such map.
+        bias: Whether scalars have biases; without them equal features give 0 by differences.
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
@@ -70,6 +80,8 @@ class RadialNet(nn.Module):
         activation: str = "relu",
         message: str = "absolute",
         residual: bool = True,
+        own_channels: Channels | None = None,
+        bias: bool = True,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
@@ -79,6 +91,7 @@ class RadialNet(nn.Module):
         self.activation, self.residual, self.dim = activation, residual, dim
         *hidden, last = layer_channels
         self.hidden_channels = hidden
+        self.own_channels = in_channels if own_channels is None else own_channels
         inputs = [in_channels, *hidden]
         outputs = [*((scalars + vectors, vectors) for scalars, vectors in hidden), last]  # a gate for each vector
         self.boundary_conv = (
@@ -90,9 +103,20 @@ class RadialNet(nn.Module):
             RadialConv(before, after, num_terms, dim, bias=False, message=message, generator=generator)
             for before, after in zip(inputs, outputs, strict=True)
         )
+        mapped = zip([self.own_channels, *hidden], outputs, strict=True)
         self.dense = nn.ModuleList(
-            VectorLinear(before, after, dim, generator) for before, after in zip(inputs, outputs, strict=True)
+            VectorLinear(before, after, dim, bias, generator) for before, after in mapped if any(before)
         )
+
+    @property
+    def own_dense(self) -> VectorLinear | None:
+        """Linear map of the first layer, if there is one."""
+        return self.dense[0] if any(self.own_channels) else None
+
+    def own(self, features: Tensor) -> Tensor:
+        """What that map takes of features (N, S + V · D)."""
+        scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
+        return join_kinds(scalars[:, scalars.shape[1] - self.own_channels[0] :], vectors[:, : self.own_channels[1]])
 
     def forward(
         self,
@@ -120,10 +144,13 @@ class RadialNet(nn.Module):
                 "`boundary_features` and `boundary_geometry` must be given exactly when the network has a boundary "
                 f"branch; it has {'none' if self.boundary_conv is None else 'one'}."
             )
-        output = self.convs[0](features, geometry) + self.dense[0](features)
+        output = self.convs[0](features, geometry)
+        if self.own_dense is not None:
+            output = output + self.own_dense(self.own(features))
         if self.boundary_conv is not None:
             output = output + self.boundary_conv(boundary_features, boundary_geometry)
-        for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], self.dense[1:], strict=True):
+        following_dense = self.dense[any(self.own_channels) :]
+        for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
             following = conv.convolve(activated, geometry) + dense(activated)
             output = following + output if self.residual and following.shape == output.shape else following

@@ -46,7 +46,7 @@ class CostCounter:
         )
 
     def _count(self, relative_cutoff: float) -> Surroundings:
-        return surroundings_of(self._inputs, relative_cutoff, self._problem.scene.particle_spacing)
+        return surroundings_of(self._inputs, relative_cutoff)
 
 
 def points_of_search(count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]) -> dict:

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
 from cconv.data.dataset import Dataset, open_dataset
+from cconv.data.metadata import OVERRIDES
 from cconv.data.targets import Sample, iterate_samples
 from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
@@ -112,16 +114,64 @@ def load_problem(
     return replace(problem, train_samples=samples["train"], valid_samples=samples["valid"])
 
 
-def provenance(study: StudyConfig) -> dict:
-    """What a checkpoint's card says of the data, so that its errors can be computed again."""
-    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json")}
+def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
+    """What a checkpoint's card says of the data, so that its errors can be computed again.
+
+    Args:
+        study: The study.
+        dataset: Its data, of which a fingerprint is kept; None where that follows later.
+    """
+    fingerprint = {} if dataset is None else {"data_sha256": dataset.fingerprint()}
+    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json"), **fingerprint}
 
 
-def data_from_card(card: Mapping, path: str | None) -> DataConfig:
-    """Data settings of a checkpoint's card, on another folder if `path` is given.
+def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None = None) -> tuple[Dataset, bool]:
+    """The data that a checkpoint is asked on: those of its card, or others.
+
+    What the card says of masses, spacing, time and force holds for the data that the model was trained on, in their
+    folder or in another with the same content. Other data speak for themselves.
+
+    Args:
+        card: Card of the checkpoint.
+        path: Folder of the data; None for the card's.
+        given: `mass`, `particle_spacing`, `frame_dt` and `force` as the user says; None where he does not.
+
+    Returns:
+        The data set, and whether the model was trained on it.
 
     Raises:
-        ConfigError: If the card's settings do not fit.
+        ConfigError: If the card's settings do not fit, or other data lack what the card says of its own.
+        DataError: If the data cannot be read.
     """
-    settings = card.get("data", {})
-    return validated(DataConfig, settings | ({"path": path} if path else {}), "card.json, data")
+    own = validated(DataConfig, card.get("data", {}), "card.json, data")
+    seed = card.get("data_seed", 0)
+    said = {name: value for name, value in (given or {}).items() if value is not None}
+    of_card = _with(own, {"path": path or own.path} | said)
+    if path is None or _same_folder(path, own.path):
+        return open_study_data(of_card, seed), True
+    other = open_study_data(_with(own, dict.fromkeys(OVERRIDES) | {"path": path} | said), seed)
+    if "data_sha256" in card and other.fingerprint() == card["data_sha256"]:
+        return open_study_data(of_card, seed), True
+    for name in ("mass", "particle_spacing"):
+        _check_stored(other, name, getattr(own, name), said)
+    return other, False
+
+
+def _with(data: DataConfig, changes: Mapping) -> DataConfig:
+    return validated(DataConfig, data.model_dump() | changes, "data")
+
+
+def _same_folder(path: str, other: str | None) -> bool:
+    return other is not None and Path(path).resolve() == Path(other).resolve()
+
+
+def _check_stored(other: Dataset, name: str, of_card: float | None, said: Mapping) -> None:
+    """Refuse data that lack what the card says of its own data, unless the user says it."""
+    topic = f"{OVERRIDES[name]}: "
+    lines = [line.removeprefix(topic) for line in other.scene.missing if line.startswith(topic)]
+    if lines and of_card is not None and name not in said:
+        option = name.replace("_", "-")
+        raise ConfigError(
+            f"{other.path}: {topic}{lines[0]}; the model's own data have {of_card:g}, which need not hold here; give "
+            f"--{option}."
+        )

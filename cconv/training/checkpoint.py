@@ -19,6 +19,7 @@ from cconv.training.field_model import FieldConfig, FieldModel, check_size
 from cconv.validation import OpenModel, Real, Seed, validated
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
+FORMAT = 2  # of config.json; models of format 1 computed in the units of their training data
 LARGEST_HEADER = 2**20  # bytes of a weights file's list of contents
 
 
@@ -49,7 +50,7 @@ def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
     fresh.mkdir(parents=True)
     try:
         save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
-        (fresh / CONFIG).write_text(model.config.model_dump_json(indent=2))
+        (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **model.config.model_dump(mode="json")}, indent=2))
         (fresh / CARD).write_text(json.dumps(card, indent=2, allow_nan=False))
         if folder.exists():
             folder.rename(old)
@@ -75,7 +76,7 @@ def load_model(path: Path | str, task: str | None = None) -> FieldModel:
             raise ConfigError(
                 f"{folder}: no {name}; give a checkpoint folder, e.g. runs/<study>/finalists/<id>/seed_0."
             )
-    config = validated(FieldConfig, read_json(folder / CONFIG, error=ConfigError), folder / CONFIG)
+    config = _read_config(folder / CONFIG)
     if task is not None and config.task != task:
         raise ConfigError(
             f"{folder}: the model is for task {config.task!r}, not {shown(task)}; give a checkpoint of that task."
@@ -87,6 +88,18 @@ def load_model(path: Path | str, task: str | None = None) -> FieldModel:
     model = FieldModel(config, features, targets)
     model.load_state_dict(tensors)
     return model.eval()
+
+
+def _read_config(path: Path) -> FieldConfig:
+    stored = read_json(path, error=ConfigError)
+    if isinstance(stored, dict):
+        version = stored.pop("format", 1)
+        if version != FORMAT:
+            raise ConfigError(
+                f"{path}: `format` is {shown(version)}, and this version reads {FORMAT}, whose models know no units of "
+                "the data; train or fit the model again (`cconv train`, `cconv fit`)."
+            )
+    return validated(FieldConfig, stored, path)
 
 
 def _read_weights(folder: Path, config: FieldConfig) -> dict[str, Tensor]:

@@ -18,9 +18,8 @@ from cconv.data.features import (
     standardize_features,
 )
 from cconv.data.features import standardize_vectors as standardize_targets
-from cconv.data.targets import VECTOR_TASKS, Sample, target_channels
+from cconv.data.targets import VECTOR_TASKS, Sample, target_channels, target_unit
 from cconv.data.trajectory import Frame, Scene
-from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import Edges, radius_graph
 from cconv.nn import ConvGeometry, ConvNet, RadialGeometry, RadialNet
@@ -81,7 +80,9 @@ class NetworkConfig(BaseModel):
 class FieldConfig(BaseModel):
     """Everything that rebuilds a model except its weights; stored as `config.json`.
 
-    Lengths are in the units of the data. `boundary_channels` is 0 for a model without a boundary branch.
+    The network computes in particle spacings, rest densities and frame intervals (`cconv.data.features.Units`).
+    `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` is that of the training data,
+    for the record. `boundary_channels` is 0 for a model without a boundary branch.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -90,7 +91,7 @@ class FieldConfig(BaseModel):
     dim: Whole = Field(ge=1, le=3)
     particle_spacing: Length
     kernel: Literal[tuple(KERNELS)]
-    smoothing_length: Length
+    relative_smoothing_length: Length
     boundary_channels: Whole = Field(ge=0, le=3)
     network: NetworkConfig
 
@@ -98,6 +99,19 @@ class FieldConfig(BaseModel):
     def feature_channels(self) -> int:
         """Features of a fluid particle: [1, v, ρ] or [1, v]."""
         return self.dim + 1 + self.network.density
+
+    @property
+    def takes_differences(self) -> bool:
+        """Whether fluid convolutions take differences of features, to which the constant adds nothing."""
+        return self.network.message == "difference"
+
+    @property
+    def has_intercept(self) -> bool:
+        """Whether there is something that does not follow from the features: biases, and a shift of the target.
+
+        A density rate from differences has none, so that it is 0 where nothing differs.
+        """
+        return not (self.takes_differences and self.task not in VECTOR_TASKS)
 
 
 @dataclass(frozen=True)
@@ -149,13 +163,18 @@ class FieldModel(nn.Module):
 
     @property
     def cutoff(self) -> float:
-        """Filter radius R in the units of the data."""
+        """Filter radius R at the training data's particle spacing, in their units."""
         return self.config.network.relative_cutoff * self.config.particle_spacing
 
     @property
     def kernel(self):
-        """SPH kernel of the density feature and the target."""
-        return kernel_named(self.config.kernel)(self.config.smoothing_length, self.config.dim)
+        """SPH kernel of the density feature and the target, at the training data's particle spacing."""
+        return self.kernel_at(self.config.particle_spacing)
+
+    def kernel_at(self, particle_spacing: float):
+        """SPH kernel of the density feature and the target in data of any particle spacing."""
+        smoothing_length = self.config.relative_smoothing_length * particle_spacing
+        return kernel_named(self.config.kernel)(smoothing_length, self.config.dim)
 
     def geometry(self, inputs: Inputs) -> FieldGeometry:
         """Neighbours and filter positions of a frame.
@@ -164,10 +183,11 @@ class FieldModel(nn.Module):
             ShapeError: If the frame has another dimension or other boundary features than the model.
         """
         self._check(inputs)
-        searches = [partial(radius_graph, inputs.positions, self.cutoff, inputs.box)]
+        cutoff = self.config.network.relative_cutoff
+        searches = [partial(radius_graph, inputs.positions, cutoff, inputs.box)]
         if self.config.boundary_channels:
             walls = inputs.boundary_positions
-            searches.append(partial(radius_graph, walls, self.cutoff, inputs.box, queries=inputs.positions))
+            searches.append(partial(radius_graph, walls, cutoff, inputs.box, queries=inputs.positions))
         fluid, *boundary = map(self._conv_geometry, results_of(searches))
         return FieldGeometry(fluid, boundary[0] if boundary else None)
 
@@ -182,23 +202,31 @@ class FieldModel(nn.Module):
         if self.config.network.basis == "radial":
             one, velocity, rho = features.tensor_split((1, self.config.dim + 1), dim=1)
             features = torch.cat([one, rho, velocity], dim=1)  # scalars come first
+        if self.config.takes_differences:
+            features = features[:, 1:]
         boundary = (inputs.boundary_features, geometry.boundary) if geometry.boundary is not None else ()
         return features, geometry.fluid, *boundary
 
     def standardize_target(self, target: Tensor) -> Tensor:
-        """Field (N, C) in the units of the data to standardised values."""
+        """Field (N, C) in a sample's units to standardised values."""
         return (target - self.target_mean) / self.target_scale
 
     @torch.no_grad()
     def predict(self, inputs: Inputs) -> Tensor:
-        """Field (N, C) in the units of the data."""
-        return self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
+        """Field (N, C) in the units of the data that the inputs were made of."""
+        field = self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
+        return field * target_unit(self.config.task, inputs.units)
 
-    def predict_frame(self, frame: Frame, box: Box) -> Tensor:
+    def predict_frame(self, frame: Frame, scene: Scene) -> Tensor:
         """Field (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
+        return self.predict(self.inputs(frame, scene))
+
+    def inputs(self, frame: Frame, scene: Scene) -> Inputs:
+        """What the model is given of a frame of a data set; densities are only summed for models that take them."""
         if not self.config.network.density:
-            return self.predict(inputs_without_density(frame, box))
-        return self.predict(make_inputs(fluid_state(frame, box, self.kernel), frame.boundary, box))
+            return inputs_without_density(frame, scene)
+        kernel = self.kernel_at(scene.particle_spacing)
+        return make_inputs(fluid_state(frame, scene.box, kernel), frame.boundary, scene)
 
     def _conv_geometry(self, edges: Edges) -> ConvGeometry | RadialGeometry:
         return _GEOMETRIES[self.config.network.basis](edges, self.config.network)
@@ -227,10 +255,22 @@ def _boundary_channels(network: NetworkConfig, inputs: Inputs) -> int:
     return 0 if inputs.boundary_features is None or not network.boundary else inputs.boundary_features.shape[1]
 
 
+def _own_channels(config: FieldConfig) -> tuple[int, int]:
+    """Scalars and vectors of a particle itself that the first layer takes, beside its convolution.
+
+    From differences the density rate does not depend on them; of a density gradient, the density is a factor. A bias
+    stands for the constant where all that is taken passes a linear map.
+    """
+    if not config.takes_differences:
+        return int(config.network.density), 1
+    return int(config.network.density and config.task in VECTOR_TASKS), 0
+
+
 def _grid_network(config: FieldConfig, generator: torch.Generator | None) -> ConvNet:
     network = config.network
+    own_channels = _own_channels(config)[0] if config.takes_differences else None
     return ConvNet(
-        config.feature_channels,
+        config.feature_channels - config.takes_differences,
         (*network.hidden_widths, target_channels(config.task, config.dim)),
         network.kernel_size,
         config.dim,
@@ -239,6 +279,8 @@ def _grid_network(config: FieldConfig, generator: torch.Generator | None) -> Con
         message=network.message,
         skip=network.skip,
         initialization=network.initialization,
+        own_channels=own_channels,
+        bias=config.has_intercept,
         generator=generator,
     )
 
@@ -248,7 +290,7 @@ def _radial_network(config: FieldConfig, generator: torch.Generator | None) -> R
     is_vector = config.task in VECTOR_TASKS
     has_normals = config.boundary_channels == config.dim
     return RadialNet(
-        (1 + network.density, 1),
+        (1 + network.density - config.takes_differences, 1),
         (*((width, width) for width in network.hidden_widths), (0, 1) if is_vector else (1, 0)),
         network.radial_terms,
         config.dim,
@@ -256,6 +298,8 @@ def _radial_network(config: FieldConfig, generator: torch.Generator | None) -> R
         activation=network.activation,
         message=network.message,
         residual=network.skip == "before_activation",
+        own_channels=_own_channels(config),
+        bias=config.has_intercept,
         generator=generator,
     )
 
@@ -295,14 +339,14 @@ def build_field_model(
         dim=scene.dim,
         particle_spacing=scene.particle_spacing,
         kernel=kernel_name,
-        smoothing_length=smoothing_length,
+        relative_smoothing_length=smoothing_length / scene.particle_spacing,
         boundary_channels=_boundary_channels(network, train_samples[0].inputs),
         network=network,
     )
     # Shifted vectors would not turn with the scene, as all of a RadialNet does.
     turns = network.basis == "radial"
     features = standardize_features((sample.inputs.features for sample in train_samples), center_velocity=not turns)
-    center = not (turns and task in VECTOR_TASKS)
+    center = config.has_intercept and not (turns and task in VECTOR_TASKS)
     targets = standardize_targets((sample.target for sample in train_samples), center)
     features = features.first(config.feature_channels)
     check_size(config, features, targets)

@@ -195,7 +195,9 @@ def training_steps(folder: Path) -> dict[str, Callable[[], None]]:
         theirs = Open3DNet(inputs.features.shape[1], inputs.boundary_features.shape[1], target.shape[1])
         features = (inputs.features - model.feature_mean) / model.feature_scale
         tensors = (features, inputs.positions, inputs.boundary_features, inputs.boundary_positions)
-        steps["Open3D"] = partial(step, theirs, adam(theirs), lambda: theirs(*tensors, 2 * model.cutoff))
+        steps["Open3D"] = partial(
+            step, theirs, adam(theirs), lambda: theirs(*tensors, 2 * model.config.network.relative_cutoff)
+        )
     return steps
 
 

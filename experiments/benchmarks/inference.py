@@ -186,7 +186,7 @@ def measure_checks(data: Path, rounds: int) -> dict:
 
     scene, frame = frame_of(data)
     sample = sample_of(scene, frame)
-    around = surroundings_of(sample.inputs, 2.0, SPACING)
+    around = surroundings_of(sample.inputs, 2.0)
     with tempfile.TemporaryDirectory() as folder:
         saved = {name: Path(folder) / str(place) for place, name in enumerate(CHECKED)}
         for name, path in saved.items():

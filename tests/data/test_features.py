@@ -19,7 +19,7 @@ def state(generator):
 
 
 def test_features_are_one_velocity_density(state):
-    inputs = make_inputs(state, None, periodic_scene().box)
+    inputs = make_inputs(state, None, periodic_scene())
     assert inputs.features.shape == (64, 4)
     assert torch.equal(inputs.features[:, 0], torch.ones(64))
     torch.testing.assert_close(inputs.features[:, 1:3], state.velocities.float())
@@ -29,8 +29,8 @@ def test_features_are_one_velocity_density(state):
 
 def test_inputs_without_density_are_the_others_less_the_last_feature(generator):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
-    whole = make_inputs(fluid_state(frame, scene.box, kernel(scene)), frame.boundary, scene.box)
-    bare = inputs_without_density(frame, scene.box)
+    whole = make_inputs(fluid_state(frame, scene.box, kernel(scene)), frame.boundary, scene)
+    bare = inputs_without_density(frame, scene)
     assert torch.equal(bare.features, whole.features[:, :-1])
     for name in ("positions", "boundary_positions", "boundary_features"):
         assert torch.equal(getattr(bare, name), getattr(whole, name))
@@ -44,7 +44,7 @@ def test_boundary_features_are_normals_or_ones(generator):
     scene = periodic_scene()
     for normals, expected in ((True, torch.tensor([[0.0, 1.0]])), (False, torch.ones(1, 1))):
         frame = with_walls(periodic_frame(generator), normals)
-        inputs = make_inputs(fluid_state(frame, scene.box, kernel(scene)), frame.boundary, scene.box)
+        inputs = make_inputs(fluid_state(frame, scene.box, kernel(scene)), frame.boundary, scene)
         torch.testing.assert_close(inputs.boundary_features, expected.expand(8, -1).clone())
 
 

@@ -96,7 +96,7 @@ def field(dim, boundary_channels, spacing=0.1):
         dim=dim,
         particle_spacing=spacing,
         kernel="cubic_spline",
-        smoothing_length=spacing,
+        relative_smoothing_length=1.0,
         boundary_channels=boundary_channels,
         network=NetworkConfig(layers=1),
     )
@@ -106,14 +106,14 @@ def field(dim, boundary_channels, spacing=0.1):
 @pytest.mark.parametrize("count", [1, 100, 512])
 def test_a_block_is_fluid_of_the_spacing_on_a_wall(count, channels):
     frame, scene = fluid_block(count, field(3, channels))
-    block = make_inputs(fluid_state(frame, scene.box, CubicSpline(0.1, 3)), frame.boundary, scene.box)
+    block = make_inputs(fluid_state(frame, scene.box, CubicSpline(0.1, 3)), frame.boundary, scene)
     assert block.num_particles == len(block.features) == count
     if count == 512:
-        neighbors = radius_graph(block.positions, 0.12).row_splits.diff()
+        neighbors = radius_graph(block.positions, 1.2).row_splits.diff()
         assert neighbors.double().mean() == pytest.approx(6 * 7 / 8, rel=0.1)  # of a lattice of 8 by 8 by 8
     if channels:
         assert block.boundary_features.shape == (len(block.boundary_positions), channels)
-        near = radius_graph(block.boundary_positions, 0.13, queries=block.positions)
+        near = radius_graph(block.boundary_positions, 1.3, queries=block.positions)
         assert len(near) >= len(block.boundary_positions) * min(1, count / len(block.boundary_positions)) * 0.9
     else:
         assert block.boundary_positions is None

@@ -134,7 +134,7 @@ def test_volumes_of_balls():
 
 def test_surroundings_are_counted_in_a_frame(generator):
     _, inputs = built(GRID[0], "density_rate", True, generator)
-    found = surroundings_of(inputs, 1.5, 1 / 8)
+    found = surroundings_of(inputs, 1.5)
     assert found.fluid_density * ball_volume(1.5, 2) == pytest.approx(
         8, abs=1
     )  # of a lattice that is a little jittered

@@ -76,7 +76,10 @@ def test_a_layer_answers_with_its_filters(generator):
     filters = first_layer_filters(model, samples[0])
     inside = (1 - (filters["line"] / model.cutoff) ** 2).clip(0) ** 3
     weights = model.network.convs[0].filters.detach().double()[0, 0]
-    weights = (weights / model.feature_scale[:, None] * model.target_scale).numpy()
+    units = samples[0].inputs.units
+    per_unit = torch.tensor([units.velocity, units.velocity, units.density])[:, None]
+    weights = weights / model.feature_scale[1:, None] * model.target_scale * samples[0].target_unit / per_unit
+    weights = torch.cat([torch.zeros(1, 1), weights]).numpy()  # differences of the constant are 0
     for axis in range(2):
         expected = inside[:, None, None] * weights
         np.testing.assert_allclose(filters["learned_on_axes"][axis], expected, rtol=1e-5, atol=1e-7)
@@ -132,7 +135,7 @@ def test_fields_are_those_of_the_model_and_files_need_no_pickle(generator, tmp_p
     np.savez(tmp_path / "best.npz", **explain(model, samples[1]), **error_distribution(model, samples))
     with np.load(tmp_path / "best.npz", allow_pickle=False) as arrays:
         np.testing.assert_array_equal(arrays["prediction"], model.predict(samples[1].inputs).numpy())
-        np.testing.assert_array_equal(arrays["target"], samples[1].target.numpy())
+        np.testing.assert_array_equal(arrays["target"], (samples[1].target * SIDE).numpy())  # ρ0/dx
         assert arrays["error"].shape == (SIDE**2,)
         assert str(arrays["task"]) == "density_gradient"
 
@@ -155,6 +158,6 @@ def test_error_distribution_counts_every_particle_also_what_is_not_finite(genera
     median = found["error_quantiles"][list(found["error_levels"]).index(0.5)]
     assert 0 < median < 0.05
     with torch.no_grad():
-        model.network.dense[0].bias.fill_(float("nan"))
+        model.network.convs[0].scalar_filters.fill_(float("nan"))
     broken = error_distribution(model, samples)
     assert broken["error_counts"][-1] == 2 * SIDE**2

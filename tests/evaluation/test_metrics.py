@@ -1,4 +1,5 @@
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from cconv.evaluation.metrics import (
     frame_errors,
     mean_predictor_error,
     normalized_mse,
+    own_variance,
     per_frame_normalized_mse,
 )
 from cconv.training.field_model import NetworkConfig
@@ -53,7 +55,7 @@ def test_per_frame_error_divides_by_the_frames_own_variance(generator):
     given = problem(generator)
     model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
     entry = frame_errors(model, given.valid_samples[:1])[0]
-    target = given.valid_samples[0].target
+    target = given.valid_samples[0].target * given.valid_samples[0].target_unit
     physical = (model.predict(given.valid_samples[0].inputs) - target).square().mean() / target.var(correction=0)
     assert entry.per_frame_normalized_mse == pytest.approx(physical.item(), rel=1e-4)
     assert per_frame_normalized_mse([entry]) == entry.per_frame_normalized_mse
@@ -78,3 +80,12 @@ def test_frames_with_a_constant_target_do_not_count_in_the_per_frame_error():
     undefined = FrameError(trajectory="0", frame=0, num_particles=10, normalized_mse=1.0, per_frame_normalized_mse=None)
     assert per_frame_normalized_mse([undefined, error(0.5)]) == 0.5
     assert per_frame_normalized_mse([undefined]) is None
+
+
+def test_an_error_by_the_own_variance_is_1_for_the_own_mean(generator):
+    given = problem(generator)
+    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    calm = [replace(sample, target=0.1 * sample.target + 3.0) for sample in given.valid_samples]
+    targets = torch.cat([sample.target for sample in calm]).double()
+    own_mean = (targets.mean() - targets).square().mean() / float(model.target_scale) ** 2
+    assert own_variance(model, calm) == pytest.approx(float(own_mean), rel=1e-4)

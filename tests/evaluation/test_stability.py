@@ -202,7 +202,7 @@ def test_regimes_share_out_all_particles_and_their_errors(model):
     probes = probes_of_model()
     errors = regime_errors(ModelPredictor(model), probes)
     shares = {name: regime.share for name, regime in probes.regimes.items()}
-    whole = torch.cat([(model.predict_frame(each.frame, each.scene.box) - each.target)[:, 0] for each in probes.plain])
+    whole = torch.cat([(model.predict_frame(each.frame, each.scene) - each.target)[:, 0] for each in probes.plain])
     for names in (
         ["near_wall", "free_surface", "bulk"],
         [name for name in shares if name.startswith("neighbors")],

@@ -66,6 +66,19 @@ def test_an_unknown_setting_is_named(saved):
         load_model(saved[2])
 
 
+@pytest.mark.parametrize("version", [None, 1, 3, "2"])
+def test_a_checkpoint_of_another_format_is_refused_with_the_way_out(saved, version):
+    path = saved[2] / "config.json"
+    config = json.loads(path.read_text()) | {"format": version}
+    if version is None:
+        del config["format"]
+    path.write_text(json.dumps(config))
+    with pytest.raises(
+        ConfigError, match=r"config\.json: `format` is .*, and this version reads 2.*fit the model again"
+    ):
+        load_model(saved[2])
+
+
 def with_weights(folder, **changes):
     """Write the weights again with other tensors; None takes one away."""
     path = folder / "model.safetensors"

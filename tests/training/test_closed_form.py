@@ -54,8 +54,8 @@ def test_saves_loads_and_evaluates_as_any_model(network, flow, tmp_path):
     model = fit_closed_form(flow, network=network)
     save_model(model, tmp_path / "model", card={})
     frame = flow.trajectory("valid", 0)[0]
-    prediction = model.predict_frame(frame, flow.scene.box)
-    assert torch.equal(load_model(tmp_path / "model").predict_frame(frame, flow.scene.box), prediction)
+    prediction = model.predict_frame(frame, flow.scene)
+    assert torch.equal(load_model(tmp_path / "model").predict_frame(frame, flow.scene), prediction)
 
 
 def test_public_names():
