@@ -107,12 +107,7 @@ def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]])
     First the winners with every other number of basis functions, which decides more than anything else; then the
     layers that differ from a winner in one setting. The most accurate winner comes first.
     """
-    with_other_terms = [
-        other
-        for record in winners
-        for other in _neighbors(record.parameters, untried)
-        if _same_but_terms(record, other)
-    ]
+    with_other_terms = [layer for record in winners for layer in untried if _same_but_terms(record, layer)]
     if with_other_terms:
         return list({layer_id(layer): layer for layer in with_other_terms}.values())
     return next(filter(None, (_neighbors(record.parameters, untried) for record in winners)), [])

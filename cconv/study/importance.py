@@ -61,8 +61,8 @@ def importance_by_rung(
     Returns:
         One entry a rung with at least ten trials and errors that differ: "updates", "trials"; "censored", whether some
         trials were stopped before, so that what is left is a selection by error; "clipped", how many count with the
-        useless error; "surrogate_r2", cross-validated; and for "f_anova" and "ped_anova" their settings, "noise_floor" and
-        "parameters", which gives "importance", "low", "high", "above_noise" for each. f-ANOVA's are shares of the
+        useless error; "surrogate_r2", cross-validated; and for "f_anova" and "ped_anova" their settings, "noise_floor"
+        and "parameters", which gives "importance", "low", "high", "above_noise" for each. f-ANOVA's are shares of the
         variance, whose rest is interactions; PED-ANOVA's are shares of the sum over all hyperparameters.
     """
     axes = axes_of(space)
@@ -72,11 +72,9 @@ def importance_by_rung(
         if len(trials) >= FEWEST_TRIALS and np.ptp(targets) > 0:
             points = coordinates(axes, [trial.parameters for trial in trials])
             entry = _entry(axes, points, targets, np.random.default_rng([seed, updates]), resamples)
-            facts = {
-                "censored": _stopped_by(records, previous),
-                "clipped": int(np.sum(targets == np.log10(useless_error))),
-            }
-            entries.append({"updates": updates, **facts, **entry})
+            clipped = int(np.sum(targets == np.log10(useless_error)))
+            facts = {"updates": updates, "censored": _stopped_by(records, previous), "clipped": clipped}
+            entries.append(facts | entry)
     return entries
 
 
