@@ -6,6 +6,7 @@ PED-ANOVA (Watanabe et al., "PED-ANOVA: Efficiently Quantifying Hyperparameter I
 2023): by which hyperparameters do the best trials differ from all? Both belong on trials that were drawn at random.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -158,7 +159,7 @@ def _ped_anova(
     axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], _seed: int, *, best_share: float
 ) -> NDArray[np.float64]:
     """Divergence of the best trials' distribution from all trials', by axis, as shares of the sum."""
-    if np.ptp(targets) == 0:
+    if np.sort(targets)[math.ceil(best_share * len(targets)) - 1] == targets.max():  # ties make all trials the best
         return np.zeros(len(axes))
     distributions = {}
     for axis in axes:

@@ -19,7 +19,7 @@ from cconv.study.initialization import train_unstopped
 from cconv.study.observer import Observer
 from cconv.study.optuna_mirror import database_answers, open_mirror
 from cconv.study.problem import load_problem, open_study_data, with_data_path
-from cconv.study.ray_pool import ray_pool
+from cconv.study.ray_pool import ray_pool, remove_left_behind
 from cconv.study.reading_stages import measure_importance, refine_space
 from cconv.study.records import FORMAT, RunFolder
 from cconv.study.search import adaptive_search, random_search, spend_otherwise
@@ -28,6 +28,8 @@ from cconv.study.session import Progress, Session
 from cconv.study.space import SearchSpace, check_baseline_affordable, fixed, recorded_space
 from cconv.study.stages import Trials, readers_of
 from cconv.validation import check_setting
+
+RAY_FILES = "ray"  # folder in that of the run
 
 STAGES: Mapping[str, Callable[[Session, str], dict]] = {
     "closed_form": screen_closed_forms,
@@ -46,10 +48,10 @@ STAGES: Mapping[str, Callable[[Session, str], dict]] = {
 
 
 def begin_study(study: StudyConfig, space: SearchSpace, run: RunFolder) -> None:
-    """Write what a run is about into its fresh folder."""
-    write_study(run, study)
+    """Write what a run is about into its fresh folder; study.json last, by which a reader knows that there is a run."""
     run.write("space.json", space.model_dump(mode="json"))
     run.set_state("running", "data")
+    write_study(run, study)
 
 
 def run_study(
@@ -78,6 +80,8 @@ def run_study(
     """
     stage = "data"
     with run.locked():
+        run.remove_half_written()
+        remove_left_behind(run.path / RAY_FILES)
         try:
             study, space = recorded_study(run), recorded_space(run)
             run.set_state("running", stage)
@@ -163,7 +167,7 @@ def _session(
 
         def start_pool():
             if not pools:
-                pools.append(stack.enter_context(ray_pool(study, problem, run.path / "ray", address)))
+                pools.append(stack.enter_context(ray_pool(study, problem, run.path / RAY_FILES, address)))
             return pools[0]
 
         if address is not None:

@@ -10,7 +10,7 @@ import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ray._private import ray_constants
@@ -22,7 +22,6 @@ PREFIX = "cconv-"
 LONGEST_SOCKET = 107  # bytes of a socket's path that Linux takes
 SESSION = "/ray/session_2026-01-01_00-00-00_000000_0000000/sockets/plasma_store"  # the longest that Ray appends
 TOKEN = "token"
-LOCK = "lock"
 TOKEN_VARIABLES = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -30,18 +29,50 @@ TOKEN_VARIABLES = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 def private_folder() -> Iterator[Path]:
     """A short folder for Ray's files and the token of this run, for its owner's eyes; it goes when the run ends.
 
-    Folders that killed runs of the same user left behind go first.
-
     Raises:
         ConfigError: If no folder for temporary files is short enough and can be written to.
     """
-    folder = _made_folder()
+    with ExitStack() as stack:
+        folder = _made_folder()
+        while not stack.enter_context(_locked(folder)):  # another run took it for left behind before it was locked
+            folder = _made_folder()
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        yield folder
+
+
+def remove_private_folders() -> None:
+    """Delete the private folders of runs that were killed: those of this user that no process has locked."""
+    for folder in (each for place in _places() for each in Path(place).glob(f"{PREFIX}????????")):
+        try:
+            if folder.is_symlink() or not folder.is_dir() or folder.stat().st_uid != os.getuid():
+                continue
+            with _locked(folder) as is_ours:
+                if is_ours:
+                    shutil.rmtree(folder, ignore_errors=True)
+        except OSError:  # already gone
+            continue
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[bool]:
+    """Hold a folder for this process alone, however that ends; False if another holds it or has deleted it."""
     try:
-        with (folder / LOCK).open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield folder
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        yield False
+        return
+    try:
+        yield _lock(descriptor) and folder.exists()
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def demand_tokens() -> None:
@@ -97,13 +128,12 @@ def check_token_of_cluster(address: str) -> None:
 def _made_folder() -> Path:
     """A folder of mode 0700 in the first place for temporary files where sockets of Ray have names short enough."""
     reasons = []
-    for place in dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")):
+    for place in _places():
         room = LONGEST_SOCKET - len(os.fsencode(f"{place}/{PREFIX}12345678{SESSION}"))
         if room < 0:
             reasons.append(f"{place} is {-room} bytes too long")
             continue
         try:
-            _remove_left_behind(Path(place))
             return Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
         except OSError as error:
             reasons.append(f"{place}: {error.strerror}")
@@ -113,14 +143,6 @@ def _made_folder() -> Path:
     )
 
 
-def _remove_left_behind(place: Path) -> None:
-    """Delete the folders of runs that were killed: those of this user whose lock nobody holds."""
-    for folder in place.glob(f"{PREFIX}????????"):
-        try:
-            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-                continue
-            with (folder / LOCK).open() as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
-        except OSError:  # in use, without a lock yet, or already gone
-            continue
+def _places() -> list[str]:
+    """Folders for temporary files, the one that the user wants first."""
+    return list(dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")))

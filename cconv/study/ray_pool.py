@@ -36,6 +36,7 @@ from cconv.study.private_ray import (  # noqa: E402
     demand_tokens,
     on_loopback_alone,
     private_folder,
+    remove_private_folders,
     token_of_this_run,
 )
 from cconv.study.problem import Problem, provenance  # noqa: E402
@@ -73,6 +74,12 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
         _start(study.concurrency, own) if address is None else _join(address)
         ray._private.worker._worker_logs_enabled = False  # our records say what died
         yield RayPool(study, problem, folder)
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Delete what killed runs left of Ray: its files of the run in `folder`, and private folders of the same user."""
+    shutil.rmtree(folder, ignore_errors=True)
+    remove_private_folders()
 
 
 def _start(cores: int, folder: Path) -> None:

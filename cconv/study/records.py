@@ -24,6 +24,9 @@ DIVERGED_ERROR = 1e9  # Optuna needs a finite number where a trial diverged; our
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
 KNOWN_BEFORE = ("init_seed", "num_parameters", "flops_per_particle")  # a training begins
 
+_PART = re.compile(r"\..+-\d+")  # names of what is being written, which a kill leaves behind
+_FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json
+
 _Count = Annotated[Whole, Field(ge=0, lt=2**63)]
 _Error = Annotated[Real, Field(ge=0)]
 
@@ -36,7 +39,7 @@ def write_json(path: Path, value) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a file under a temporary name, then rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}-{os.getpid()}")
+    part = path.with_name(f".{path.name}-{os.getpid()}")  # `_PART` matches it
     try:
         part.write_text(text)
         os.replace(part, path)
@@ -315,11 +318,13 @@ class RunFolder:
     def create(cls, path: Path | str, overwrite: bool = False) -> "RunFolder":
         """A new run folder; with `overwrite` it replaces an older run, never anything else.
 
+        A folder whose run was killed before study.json was written counts as new.
+
         Raises:
             ConfigError: If the folder exists already.
         """
         run = cls(path)
-        if overwrite and (run.path / "study.json").is_file():
+        if run.path.is_dir() and (run._is_barely_begun() or (overwrite and (run.path / "study.json").is_file())):
             shutil.rmtree(run.path)
         try:
             run.path.mkdir(parents=True)
@@ -328,6 +333,18 @@ class RunFolder:
                 f"{run.path}: exists already; give another --out, or --overwrite to replace an older run."
             ) from error
         return run
+
+    def _is_barely_begun(self) -> bool:
+        names = {path.name for path in self.path.iterdir()}
+        return bool(names) and all(name in _FIRST_FILES or _PART.fullmatch(name) for name in names)
+
+    def remove_half_written(self) -> None:
+        """Delete what a killed process was writing; only who holds the folder may."""
+        for path in [path for path in self.path.rglob(".*") if _PART.fullmatch(path.name)]:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete the folder and everything in it."""
@@ -364,6 +381,10 @@ class RunFolder:
             except BlockingIOError as error:
                 raise ConfigError(
                     f"{self.path}: another run works in this folder; wait for it (`cconv study status`) or stop it."
+                ) from error
+            except OSError as error:
+                raise ConfigError(
+                    f"{file.name}: cannot be locked ({error.strerror}); put the run folder on a file system with locks."
                 ) from error
             yield
 

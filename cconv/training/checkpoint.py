@@ -34,30 +34,29 @@ class _Card(OpenModel):
 def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
     """Write a model: `model.safetensors`, `config.json`, `card.json`.
 
-    The files are written to a temporary folder that then takes the place of `folder`, so that a reader never finds half
-    a model.
+    The files are written to a temporary folder that then takes the place of `folder`, or that of its files one by one
+    where it exists, so that a reader finds a whole model also after a kill at any time.
 
     Args:
         model: Model to save.
-        folder: Folder of the model; its earlier content is replaced.
+        folder: Folder of the model; an earlier model is replaced.
         card: Metrics and provenance, JSON values.
     """
     folder = Path(folder)
     fresh = folder.with_name(f".{folder.name}-{os.getpid()}")
-    old = folder.with_name(f"{fresh.name}-old")
-    for rest in (fresh, old):
-        shutil.rmtree(rest, ignore_errors=True)
+    shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     try:
         save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
         (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **model.config.model_dump(mode="json")}, indent=2))
         (fresh / CARD).write_text(json.dumps(card, indent=2, allow_nan=False))
-        if folder.exists():
-            folder.rename(old)
-        fresh.rename(folder)
+        if not folder.exists():
+            fresh.rename(folder)
+            return
+        for name in (CONFIG, WEIGHTS, CARD):
+            os.replace(fresh / name, folder / name)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def load_model(path: Path | str, task: str | None = None) -> FieldModel:

@@ -172,3 +172,11 @@ def test_partial_dependence_refuses_what_it_cannot_show():
         partial_dependence(records, SPACE, 10, "only", useless_error=1.0)
     with pytest.raises(ConfigError, match="0 trials have 11 updates"):
         partial_dependence(records, SPACE, 11, "word", useless_error=1.0)
+
+
+def test_where_ties_make_all_trials_the_best_none_of_them_differs_from_all():
+    """Optuna would warn on the terminal that its quantiles are the same; warnings are errors here."""
+    tied = [record(number, drawn(np.random.default_rng(number)), {10: 1.0}) for number in range(23)]
+    best = record(23, drawn(np.random.default_rng(23)), {10: 0.5})
+    (entry,) = importance_by_rung([*tied, best], SPACE, [10], resamples=3, useless_error=1.0)
+    assert all(judged["importance"] == 0 for judged in entry["ped_anova"]["parameters"].values())

@@ -15,7 +15,7 @@ from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
 from cconv.study.config import load_study
-from cconv.study.private_ray import LOCK, PREFIX, private_folder
+from cconv.study.private_ray import PREFIX, private_folder, remove_private_folders
 from cconv.study.ray_pool import ray_pool
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
@@ -107,14 +107,32 @@ def test_folders_of_killed_runs_go_and_those_in_use_stay(tmp_path, monkeypatch):
     monkeypatch.setattr("cconv.study.private_ray.LONGEST_SOCKET", 1000)
     left = tmp_path / f"{PREFIX}abcdefgh"
     left.mkdir()
-    (left / LOCK).touch()
+    other = tmp_path / f"{PREFIX}is_a_file"[: len(left.name)]
+    other.touch()
     with private_folder() as first:
-        assert not left.exists()
+        remove_private_folders()
+        assert (left.exists(), other.exists(), first.is_dir()) == (False, True, True)
         with private_folder() as second:
-            assert first.is_dir()
             assert first != second
         assert not second.exists()
     assert not first.exists()
+
+
+def test_a_folder_that_another_run_deletes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr("cconv.study.private_ray.LONGEST_SOCKET", 1000)
+    make, made = tempfile.mkdtemp, []
+
+    def deleted_the_first_time(**where):
+        made.append(make(**where))
+        if len(made) == 1:
+            remove_private_folders()
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "mkdtemp", deleted_the_first_time)
+    with private_folder() as folder:
+        assert [str(folder)] == made[1:]
+        assert folder.is_dir()
 
 
 def test_a_long_place_for_temporary_files_is_passed_over(tmp_path, monkeypatch):

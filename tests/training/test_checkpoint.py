@@ -1,4 +1,7 @@
+import itertools
 import json
+import os
+import sys
 
 import pytest
 import torch
@@ -31,6 +34,38 @@ def test_saving_again_replaces_and_leaves_nothing_behind(saved):
     save_model(model, folder, {"valid_normalized_mse": 0.25})
     assert read_card(folder)["valid_normalized_mse"] == 0.25
     assert [path.name for path in folder.parent.iterdir()] == ["checkpoint"]
+
+
+def test_a_kill_at_any_time_leaves_a_whole_model(saved):
+    """A child process replaces the model and ends itself at its first file operation, then at its second, and so on."""
+    given, model, folder = saved
+    other = given.build_model(model.config.network, 1)
+    known = [each.predict(given.valid_samples[0].inputs) for each in (model, other)]
+    for operation in itertools.count(1):
+        child = os.fork()
+        if child == 0:
+            _end_at(operation)
+            save_model(other, folder, {"valid_normalized_mse": 0.25})
+            os._exit(0)
+        ended_early = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+        found = load_model(folder).predict(given.valid_samples[0].inputs)
+        assert any(torch.equal(found, each) for each in known)
+        assert read_card(folder)["valid_normalized_mse"] in (0.5, 0.25)
+        if not ended_early:
+            break
+    assert torch.equal(found, known[1])
+    assert operation > 5
+
+
+def _end_at(operation):
+    """End this process, as SIGKILL would, at its file operation of that number."""
+    left = itertools.count(operation - 1, -1)
+
+    def count(event, arguments):
+        if event in ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "shutil.rmtree") and next(left) == 0:
+            os._exit(9)
+
+    sys.addaudithook(count)
 
 
 def test_a_checkpoint_of_another_task_is_refused(saved):
