@@ -1,6 +1,7 @@
 """Files and folders that appear whole or not at all."""
 
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -46,6 +47,7 @@ def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterato
         partial.mkdir(parents=True)
         yield partial
         _replace(folder, partial)
+        _remove_left_behind(folder)
     except OSError as error:
         reason = " ".join(str(error.strerror or error).split())  # HDF5 tells in several lines
         raise ConfigError(f"{folder}: cannot be written ({reason}); name another folder.") from error
@@ -64,6 +66,15 @@ def check_free(folder: Path, files: Iterable[str], overwrite: bool) -> None:
         raise ConfigError(f"{folder}: holds other things than a data set ({others}); name another folder.")
     if present and not overwrite:
         raise ConfigError(f"{folder}: exists and is not empty; name another folder or overwrite it.")
+
+
+def _remove_left_behind(folder: Path) -> None:
+    """Delete what processes that were killed had written of the same folder."""
+    left = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.partial(\.old)?")
+    for path in folder.parent.iterdir():
+        match = left.fullmatch(path.name)
+        if match and not Path("/proc", match[1]).exists():
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _replace(folder: Path, new: Path) -> None:

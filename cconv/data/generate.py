@@ -7,14 +7,9 @@ on where it stopped.
 import fcntl
 import hashlib
 import json
-import multiprocessing
 import os
 import shutil
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +23,7 @@ from cconv import scenes, sph
 from cconv.data.folders import check_free
 from cconv.data.hdf5 import FILES, write_dataset
 from cconv.data.metadata import OWN_KEY
+from cconv.data.side_by_side import side_by_side
 from cconv.data.simulate import Simulation, simulate
 from cconv.data.source import SPLITS, STORED
 from cconv.data.splits import share_out, split_in_time
@@ -37,7 +33,7 @@ from cconv.scenes.simulated_scene import SimulatedScene
 
 Progress = Callable[[Iterable, str], Iterable]
 SPLIT_FRACTIONS = (0.5, 0.25, 0.25)  # as LagrangeBench
-_REQUEST, _LOCK, _SUFFIX, _PARTIAL = "request.json", "lock", ".safetensors", ".partial"
+_REQUEST, _LOCK, _WRITING, _SUFFIX, _PARTIAL = "request.json", "lock", "writing", ".safetensors", ".partial"
 
 
 class Generated(NamedTuple):
@@ -88,15 +84,17 @@ def generate(
     count = scene.num_trajectories if num_trajectories is None else num_trajectories
     frames = scene.num_frames if num_frames is None else num_frames
     _check_numbers(count, frames, workers)
-    check_free(folder, FILES, overwrite)
-    unfinished = folder.with_name(f"{folder.name}.unfinished")
-    with _unfinished_folder(unfinished, _request(scene, frames, seed), overwrite):
+    unfinished, request = folder.with_name(f"{folder.name}.unfinished"), _request(scene, frames, seed)
+    may_replace = overwrite or ((unfinished / _WRITING).exists() and _read(unfinished / _REQUEST) == request)
+    check_free(folder, FILES, may_replace)
+    with _unfinished_folder(unfinished, request, overwrite):
         files = [unfinished / f"{index:05d}{_SUFFIX}" for index in range(count)]
         calls = [(scene, frames, seed, index, file) for index, file in enumerate(files) if not _is_whole(file)]
         workers = max(1, min(workers or len(os.sched_getaffinity(0)), len(calls)))
         for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
             pass
-        write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), overwrite)
+        (unfinished / _WRITING).touch()  # what is in the folder from now on is ours
+        write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), may_replace)
         failures = tuple(line for file in files for line in _facts(file)["failures"])
         shutil.rmtree(unfinished)
     return Generated(count - len(calls), failures)
@@ -126,64 +124,13 @@ class _Frames:
 
     def __iter__(self) -> Iterator[None]:
         frames = (
-            self._side_by_side() if self._workers > 1 else (frame for call in self._calls for frame in _compute(*call))
+            side_by_side(_compute, self._calls, self._workers)
+            if self._workers > 1
+            else (frame for call in self._calls for frame in _compute(*call))
         )
         for number, _ in enumerate(frames):
             if number < self._total:  # starts that blew up are computed again, but not counted
                 yield
-
-    def _side_by_side(self) -> Iterator[None]:
-        context = multiprocessing.get_context("spawn")
-        counter, stop = context.Value("q", 0), context.Event()
-        threads = max(1, len(os.sched_getaffinity(0)) // self._workers)
-        with ProcessPoolExecutor(self._workers, context, _start_worker, (counter, stop, threads)) as pool:
-            futures = [pool.submit(_compute_in_worker, *call) for call in self._calls]
-            try:
-                yield from _counted(futures, counter)
-            except BrokenProcessPool as error:
-                raise DataError(
-                    "A worker process was ended from outside, perhaps for want of memory; take fewer workers and give "
-                    'the same command again. In a script, call `generate` under `if __name__ == "__main__":`.'
-                ) from error
-            except BaseException:
-                stop.set()
-                pool.shutdown(cancel_futures=True)
-                raise
-
-
-def _counted(futures: list[Future], counter) -> Iterator[None]:
-    """Yield whenever the counter grows, until all futures are done; raises what the first that failed raised."""
-    shown, going = 0, set(futures)
-    while going:
-        finished, going = wait(going, timeout=0.1, return_when=FIRST_EXCEPTION)
-        for future in finished:
-            future.result()
-        for _ in range(shown, counter.value):
-            shown += 1
-            yield
-
-
-_progress: dict = {}  # of a worker process: the counter that its parent listens to
-
-
-def _start_worker(counter, stop, threads: int) -> None:
-    _progress["counter"] = counter
-    torch.set_num_threads(threads)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
-    threading.Thread(target=_end_when_told, args=(stop,), daemon=True).start()
-
-
-def _end_when_told(stop) -> None:
-    """End this process, whatever it computes, when the parent says so or is gone."""
-    while not stop.wait(0.2) and multiprocessing.parent_process().is_alive():
-        pass
-    os._exit(1)
-
-
-def _compute_in_worker(*call) -> None:
-    for _ in _compute(*call):
-        with _progress["counter"].get_lock():
-            _progress["counter"].value += 1
 
 
 def _compute(scene: SimulatedScene, num_frames: int, seed: int, index: int, file: Path) -> Iterator[None]:
@@ -256,7 +203,11 @@ def _prepare(unfinished: Path, request: dict, overwrite: bool) -> None:
     """Keep what belongs to the request; delete what belongs to another only if it may be overwritten."""
     files = [file for file in unfinished.iterdir() if file.name != _LOCK]
     if files and _read(unfinished / _REQUEST) != request:
-        others = [file.name for file in files if file.name != _REQUEST and file.suffix not in (_SUFFIX, _PARTIAL)]
+        others = [
+            file.name
+            for file in files
+            if file.name not in (_REQUEST, _WRITING) and file.suffix not in (_SUFFIX, _PARTIAL)
+        ]
         if others:
             raise ConfigError(f"{unfinished}: holds other things ({others[0]}); move them or name another folder.")
         if not overwrite:

@@ -198,6 +198,28 @@ def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     assert not unfinished.exists()
 
 
+def test_a_generation_that_is_killed_once_its_data_are_in_place_comes_to_its_end(tmp_path, monkeypatch):
+    remove = module.shutil.rmtree
+
+    def interrupt_at_the_end(path, **how):
+        return _interrupt() if path.name == "a.unfinished" else remove(path, **how)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module.shutil, "rmtree", interrupt_at_the_end)
+        with pytest.raises(KeyboardInterrupt):
+            made(tmp_path / "a")
+    left = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    (tmp_path / f".a.{left.stdout.strip()}.partial").mkdir()
+    (tmp_path / f".a.{os.getppid()}.partial").mkdir()
+    before = (tmp_path / "a" / "train.h5").read_bytes()
+    _, done = made(tmp_path / "a")
+    assert done.reused == 4
+    assert (tmp_path / "a" / "train.h5").read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"a", f".a.{os.getppid()}.partial"}
+    with pytest.raises(ConfigError, match="exists and is not empty"):
+        made(tmp_path / "a")
+
+
 def test_a_full_disk_is_told_and_finished_trajectories_stay(tmp_path, monkeypatch):
     real, written = module.save_file, []
 

@@ -3,6 +3,7 @@
 A port belongs to a process, so that where no process is left no port is.
 """
 
+import itertools
 import os
 import random
 import shutil
@@ -57,6 +58,13 @@ class Victim:
         self.await_end()
         return False
 
+    def fresh_folders(self, parent):
+        """Another folder to write to, until there were enough kills."""
+        for number in itertools.count():
+            if self.kills >= KILLS:
+                return
+            yield parent / f"killed_{number}"
+
     def await_end(self):
         """Wait until no process with the mark is left."""
         deadline = time.monotonic() + ENDS_BY_ITSELF
@@ -107,13 +115,12 @@ def seconds_of(command):
 
 
 def test_a_study_that_is_killed_again_and_again_keeps_every_finished_trial(flow_folder, tmp_path):
-    study = write_search(tmp_path, "killed", concurrency=2, random=8, adaptive=4)
-    begin = [SCRIPT, "study", "run", study, "--data", flow_folder, "--out"]
+    study = write_search(tmp_path, "killed", concurrency=2, random=4, adaptive=2)
+    begin = [SCRIPT, "study", "run", study, "--data", flow_folder, "--set", "training.updates=12", "--out"]
     longest = seconds_of([*begin, tmp_path / "whole"])
     outcomes = [(record.id, record.parameters) for record in RunFolder(tmp_path / "whole").trials_of("random")]
     with victim(seed=0) as killed:
-        while killed.kills < KILLS:
-            folder = tmp_path / f"after_{killed.kills}"
+        for folder in killed.fresh_folders(tmp_path):
             ended, before = killed.run([*begin, folder], longest), {}
             while not ended:
                 before |= finished_trials(folder)
@@ -127,16 +134,16 @@ def test_a_study_that_is_killed_again_and_again_keeps_every_finished_trial(flow_
 
 
 def test_data_that_are_killed_again_and_again_keep_every_finished_trajectory(tmp_path):
-    settings = ["--size", "small", "--trajectories", "8", "--frames", "6", "--workers", "2"]
+    settings = ["--size", "small", "--trajectories", "6", "--frames", "3", "--workers", "2"]
     command = [SCRIPT, "data", "generate", "taylor_green_2d", *settings, "--out"]
     longest = seconds_of([*command, tmp_path / "whole"])
     expected = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
     with victim(seed=1) as killed:
-        while killed.kills < KILLS:
-            folder = tmp_path / f"after_{killed.kills}"
+        for folder in killed.fresh_folders(tmp_path):
             unfinished, ended, before = folder.with_name(f"{folder.name}.unfinished"), False, {}
             while not ended:
                 ended = killed.run([*command, folder], longest if killed.kills < KILLS else PATIENCE)
+                ended = ended or (folder.exists() and not unfinished.exists())  # killed after all was done
                 now = {path.name: path.stat().st_ino for path in unfinished.glob("*.safetensors")}
                 assert ended or before.items() <= now.items()  # none was computed a second time
                 before = now
