@@ -3,6 +3,7 @@ import torch
 from systems import kernel, periodic_frame, periodic_scene, with_walls
 
 from cconv.data.features import (
+    Units,
     fluid_state,
     inputs_without_density,
     make_inputs,
@@ -22,8 +23,12 @@ def test_features_are_one_velocity_density(state):
     inputs = make_inputs(state, None, periodic_scene())
     assert inputs.features.shape == (64, 4)
     assert torch.equal(inputs.features[:, 0], torch.ones(64))
-    torch.testing.assert_close(inputs.features[:, 1:3], state.velocities.float())
+    units = Units(length=1 / 8, density=1.0, time=0.01)  # masses are dx²
+    assert inputs.units == units
+    torch.testing.assert_close(inputs.positions, 8 * state.positions.float())
+    torch.testing.assert_close(inputs.features[:, 1:3], 0.08 * state.velocities.float())
     torch.testing.assert_close(inputs.features[:, 3], state.densities.float())
+    assert inputs.box.lengths == (8.0, 8.0)
     assert inputs.features.dtype == torch.float32
 
 

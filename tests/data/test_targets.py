@@ -28,8 +28,9 @@ def test_density_rate_is_the_change_of_density_along_the_motion(generator):
         )  # fmt: skip
         densities.append(fluid_state(shifted, scene.box, kernel(scene)).densities)
     expected = (densities[1] - densities[0]) / (2 * step)
-    target = make_sample(frame, scene, "density_rate", kernel(scene)).target[:, 0]
-    torch.testing.assert_close(target.double(), expected, atol=1e-4, rtol=1e-4)
+    sample = make_sample(frame, scene, "density_rate", kernel(scene))
+    assert sample.target_unit == 100.0  # rest density 1 in a frame's time of 0.01
+    torch.testing.assert_close(100 * sample.target[:, 0].double(), expected, atol=1e-4, rtol=1e-4)
 
 
 def test_unknown_task_is_refused_with_the_nearest(generator):
