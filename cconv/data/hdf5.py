@@ -73,9 +73,9 @@ class LagrangeBenchSource:
                 self.metadata,
                 folder / METADATA,
                 given,
-                stores_velocity="velocity" in group,
-                stores_mass="mass" in group,
-                has_boundary="boundary_position" in group or bool(_is_wall(types).any()),
+                stores_velocity=_has(group, "velocity"),
+                stores_mass=_has(group, "mass"),
+                has_boundary=_has(group, "boundary_position") or bool(_is_wall(types).any()),
             )
 
     def num_frames(self, name: str) -> int:
@@ -305,6 +305,11 @@ def _is_trajectory(file: h5py.File, name: str, path: Path) -> bool:
     raise DataError(f"{path}: a group is named {one_line(name)!r}; name trajectories 00000, 00001, ...")
 
 
+def _has(group: h5py.Group, key: str) -> bool:
+    """Whether there is such a link; nothing is followed."""
+    return group.get(key, getlink=True) is not None
+
+
 def _member(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
     """A data set that may be read: it was written, lies in the folder and fits into memory."""
     stored = linked(group, key, f"{file}: trajectory {name}")
@@ -320,14 +325,18 @@ def _types(group: h5py.Group, file: Path, name: str, particles: int | str) -> Te
     types = _required(group, "particle_type", file, name, (particles,)).long()
     known = [int(kind) for kind in ParticleType]
     values, counts = types.unique(return_counts=True)
-    unknown = [f"{value} ({count} times)" for value, count in zip(values.tolist(), counts.tolist()) if value not in known]
+    unknown = [
+        f"{value} ({count} times)" for value, count in zip(values.tolist(), counts.tolist()) if value not in known
+    ]
     if unknown:
         raise DataError(
             f"{file}: trajectory {name}: `particle_type` has unknown values {one_line(', '.join(unknown))}; "
             f"known are {', '.join(f'{int(kind)} ({kind.name.lower()})' for kind in ParticleType)}: correct them."
         )
     if ParticleType.FLUID not in types:
-        raise DataError(f"{file}: trajectory {name}: no particle is fluid (`particle_type` 0); there is nothing to learn.")
+        raise DataError(
+            f"{file}: trajectory {name}: no particle is fluid (`particle_type` 0); there is nothing to learn."
+        )
     return types
 
 
@@ -339,7 +348,7 @@ def _required(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[i
 
 
 def _optional(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor | None:
-    return _required(group, key, file, name, shape) if key in group else None
+    return _required(group, key, file, name, shape) if _has(group, key) else None
 
 
 def _finite_frames(stored: h5py.Dataset, frames: slice, file: Path, name: str) -> Tensor:

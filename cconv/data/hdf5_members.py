@@ -93,7 +93,9 @@ def _source_bytes(source: tuple[str, str], file: Path, folder: Path, place: str,
     name, member = source
     path = (file if name == "." else file.parent / name).resolve()
     if depth >= DEEPEST or not path.is_relative_to(folder.resolve()):
-        raise DataError(f"{place} is read from {one_line(name)}, outside of its folder; write its values into the file.")
+        raise DataError(
+            f"{place} is read from {one_line(name)}, outside of its folder; write its values into the file."
+        )
     if not path.is_file():
         raise DataError(f"{place} is read from {one_line(name)}, which is missing; copy that file as well.")
     with h5py.File(path, "r") as opened:
