@@ -326,7 +326,9 @@ def _types(group: h5py.Group, file: Path, name: str, particles: int | str) -> Te
     known = [int(kind) for kind in ParticleType]
     values, counts = types.unique(return_counts=True)
     unknown = [
-        f"{value} ({count} times)" for value, count in zip(values.tolist(), counts.tolist()) if value not in known
+        f"{value} ({count} times)"
+        for value, count in zip(values.tolist(), counts.tolist(), strict=True)
+        if value not in known
     ]
     if unknown:
         raise DataError(

@@ -47,7 +47,6 @@ def virtual(group, name):
 
 
 def half_virtual(group, folder):
-    (folder / "valid.h5").exists()
     layout = h5py.VirtualLayout(SHAPE, "f4")
     layout[:3] = h5py.VirtualSource("valid.h5", "00000/position", SHAPE)[:3]
     group.create_virtual_dataset("position", layout)
