@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.errors import ConfigError
@@ -128,7 +129,9 @@ def generate(
     for failure in done.failures:
         errors.print(f"cconv: replaced a start that blew up: {failure}", markup=False, highlight=False, soft_wrap=True)
     resumed = f", {done.reused} of them from an earlier run" if done.reused else ""
-    results.print(f"{trajectories or chosen.num_trajectories} trajectories{resumed}: {out}", soft_wrap=True)
+    results.print(
+        f"{trajectories or chosen.num_trajectories} trajectories{resumed}: {out}", soft_wrap=True, markup=False
+    )
 
 
 @app.command()
@@ -174,7 +177,7 @@ def convert(
     from cconv.data.convert import convert as run
 
     run(_open(path, mass, particle_spacing, frame_dt, force), out, overwrite, show_progress)
-    results.print(f"{path} as LagrangeBench HDF5: {out}")
+    results.print(f"{path} as LagrangeBench HDF5: {out}", markup=False)
 
 
 @app.command()
@@ -239,12 +242,12 @@ def show(
     sequence = range(0, len(shown), every)
     if vtk is not None:
         series = write_vtk(vtk, shown, dataset.scene, sequence, overwrite, show_progress)
-        results.print(f"{len(sequence)} frames for ParaView: {series}")
+        results.print(f"{len(sequence)} frames for ParaView: {series}", markup=False)
     if animate is not None:
         particles.write_animation(animate, shown, dataset.scene, sequence, color, show_progress)
-        results.print(f"Animation of {len(sequence)} frames: {animate}")
+        results.print(f"Animation of {len(sequence)} frames: {animate}", markup=False)
     particles.write_picture(figure, picture)
-    results.print(f"Picture of {len(chosen)} frames: {picture}")
+    results.print(f"Picture of {len(chosen)} frames: {picture}", markup=False)
 
 
 def parse_frames(text: str) -> list[int]:
@@ -286,11 +289,11 @@ def _open(path: Path, mass, particle_spacing, frame_dt, force: str | None):
 
 
 def _table(facts: dict) -> Table:
-    table = Table(title=facts["path"], show_header=False, title_justify="left")
+    table = Table(title=Text(facts["path"]), show_header=False, title_justify="left")
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for label, text in _rows(facts):
-        table.add_row(label, text)
+        table.add_row(label, Text(text))  # names and sources are foreign: no markup in them
     return table
 
 

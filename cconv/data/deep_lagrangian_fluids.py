@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 import msgpack
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 import zstandard
 from torch import Tensor
 
+from cconv.data.limits import memory_limit, one_line
 from cconv.data.source import SPLITS, STORED, Given, as_tensor, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory
 from cconv.domain import Box
@@ -28,6 +30,9 @@ from cconv.errors import DataError
 SUFFIX = ".msgpack.zst"
 REST_DENSITY = 1000.0
 PARTICLE_SPACING = 0.05
+LARGEST_WINDOW = 2**31  # bytes that zstd looks back at most
+PIECE = 2**24  # bytes decompressed at a time
+COPIES = 3  # of the content at the same time: bytes, decoded frames, stacked frames
 
 
 class DeepLagrangianFluidsSource:
@@ -162,11 +167,15 @@ def decode_array(record: dict) -> object:
         DataError: If the dtype is not a plain boolean, integer or floating point one. Objects would be pickles, and
             unpickling runs code.
     """
+    if "nd" in record:  # packed by an old msgpack, or unpacked and packed again
+        record = {key.encode() if isinstance(key, str) else key: value for key, value in record.items()}
     if b"nd" not in record:
         return record
     dtype_name = record.get(b"type")
-    if not isinstance(dtype_name, str) or not re.fullmatch(r"[<>|=]?[bfiu]\d+", dtype_name):
-        raise DataError(f"an array has dtype {dtype_name!r}; only plain numbers are read, as objects could run code.")
+    if not isinstance(dtype_name, str) or not re.fullmatch(r"[<>|=]?[bfiu][1248]", dtype_name):
+        raise DataError(
+            f"an array has dtype {one_line(dtype_name)!r}; only plain numbers are read, as objects could run code."
+        )
     try:
         values = np.frombuffer(record[b"data"], dtype=np.dtype(dtype_name))
         return values.reshape(record[b"shape"]) if record[b"nd"] else values.reshape(())[()]
@@ -208,7 +217,7 @@ def _count_frames(file: Path) -> int:
     """Number of frames in a file, from the head of its list."""
     unpacker = msgpack.Unpacker()
     try:
-        with file.open("rb") as stream, zstandard.ZstdDecompressor().stream_reader(stream) as reader:
+        with file.open("rb") as stream, _decompressed(stream) as reader:
             unpacker.feed(reader.read(5))
         count = unpacker.read_array_header()
     except (OSError, zstandard.ZstdError, msgpack.UnpackException, ValueError) as error:
@@ -221,25 +230,41 @@ def _count_frames(file: Path) -> int:
 def _load(file: Path) -> list[dict]:
     """All frames of a file."""
     try:
-        with file.open("rb") as stream, zstandard.ZstdDecompressor().stream_reader(stream) as reader:
-            frames = msgpack.unpackb(reader.read(), raw=False, strict_map_key=False, object_hook=decode_array)
+        frames = msgpack.unpackb(_unpacked_bytes(file), raw=False, strict_map_key=False, object_hook=decode_array)
     except DataError as error:
         raise DataError(f"{file}: {error}") from error
-    except (OSError, zstandard.ZstdError, msgpack.UnpackException, ValueError) as error:
+    except (OSError, zstandard.ZstdError, msgpack.UnpackException, ValueError, TypeError, MemoryError) as error:
         raise _damaged(file, error) from error
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{file}: must hold a list of frames, each a mapping; copy or convert it again.")
     return frames
 
 
+def _decompressed(stream: BinaryIO) -> zstandard.ZstdDecompressionReader:
+    """A reader over all zstd frames of a stream, one after the other (pzstd writes several)."""
+    return zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW).stream_reader(stream, read_across_frames=True)
+
+
+def _unpacked_bytes(file: Path) -> bytearray:
+    """What a file decompresses to, refused as soon as it is more than fits into memory."""
+    content, room = bytearray(), memory_limit() // COPIES
+    with file.open("rb") as stream, _decompressed(stream) as reader:
+        while piece := reader.read(PIECE):
+            content += piece
+            if len(content) > room:
+                raise DataError(f"decompresses to more than the {room / 1e9:.3g} GB that fit into memory; cut it.")
+    return content
+
+
 def _damaged(file: Path, error: Exception) -> DataError:
-    what = "is empty" if file.stat().st_size == 0 else f"is truncated or not zstd-compressed msgpack ({error})"
+    reason = one_line(error)
+    what = "is empty" if file.stat().st_size == 0 else f"is truncated or not zstd-compressed msgpack ({reason})"
     return DataError(f"{file}: {what}; copy it again.")
 
 
 def _member(file: Path, frame: Mapping, name: str, key: str) -> object:
     if key not in frame:
-        known = ", ".join(str(known) for known in frame)
+        known = one_line(", ".join(str(known) for known in frame))
         raise DataError(f"{file}: trajectory {name}: key `{key}` is missing; frames must hold it (found: {known}).")
     return frame[key]
 

@@ -7,6 +7,7 @@ frame), `mass` (N,), `viscosity` (N,), `boundary_position` (B, D) and `boundary_
 Source: Toshev et al. (2023), LagrangeBench: A Lagrangian Fluid Mechanics Benchmarking Suite, and its data sets.
 """
 
+import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +18,8 @@ import torch
 from torch import Tensor
 
 from cconv.data.folders import whole_folder
-from cconv.data.hdf5_members import check_readable, linked_member
+from cconv.data.hdf5_members import check_stored, linked
+from cconv.data.limits import one_line
 from cconv.data.metadata import (
     METADATA,
     default_mass,
@@ -29,10 +31,12 @@ from cconv.data.metadata import (
 from cconv.data.source import SPLITS, STORED, Given, as_tensor, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory, finite_difference_velocities
 from cconv.domain import Box
-from cconv.errors import CConvError, DataError
+from cconv.errors import DataError
 
 FILES = (*(f"{split}.h5" for split in SPLITS), METADATA)
 FRAMES_PER_CHUNK = 8
+MOST_TRAJECTORIES = 100_000
+LONGEST_NAME = 100
 
 
 class LagrangeBenchSource:
@@ -64,14 +68,14 @@ class LagrangeBenchSource:
         self.stored_splits = {split: _trajectory_names(split, file) for split, file in self._file_of.items()}
         self.names = tuple(name for names in self.stored_splits.values() for name in names)
         with self._group(self.names[0]) as (file, group):
-            types = _required(group, "particle_type", file, self.names[0], ("particles",))
+            types = _types(group, file, self.names[0], "particles")
             self.scene = scene_from_metadata(
                 self.metadata,
                 folder / METADATA,
                 given,
-                stores_velocity="velocity" in group,
-                stores_mass="mass" in group,
-                has_boundary="boundary_position" in group or bool(_is_wall(types).any()),
+                stores_velocity=_has(group, "velocity"),
+                stores_mass=_has(group, "mass"),
+                has_boundary=_has(group, "boundary_position") or bool(_is_wall(types).any()),
             )
 
     def num_frames(self, name: str) -> int:
@@ -86,7 +90,7 @@ class LagrangeBenchSource:
             frames = slice(start, stop)
             positions = _finite_frames(stored, frames, file, name)
             particles = positions.shape[1]
-            types = _required(group, "particle_type", file, name, (particles,)).long()
+            types = _types(group, file, name, particles)
             return Trajectory(
                 name=name,
                 first_frame=start,
@@ -102,7 +106,7 @@ class LagrangeBenchSource:
     def _group(self, name: str) -> Iterator[tuple[Path, h5py.Group]]:
         split, _, group = name.partition("/")
         with _opened(self._file_of[split]) as file:
-            yield self._file_of[split], linked_member(file, group, self._file_of[split])
+            yield self._file_of[split], linked(file, group, str(self._file_of[split]))
 
     def _positions(self, group: h5py.Group, file: Path, name: str) -> h5py.Dataset:
         stored, dim = _member(group, "position", file, name), self.scene.dim
@@ -273,8 +277,10 @@ def _check_complete(folder: Path, files: Iterable[Path]) -> None:
 
 def _trajectory_names(split: str, path: Path) -> tuple[str, ...]:
     with _opened(path) as file:
-        groups = [name for name in sorted(file) if isinstance(linked_member(file, name, path), h5py.Group)]
-        names = tuple(f"{split}/{name}" for name in groups)
+        members = itertools.islice(file, MOST_TRAJECTORIES + 1)
+        names = tuple(f"{split}/{name}" for name in sorted(members) if _is_trajectory(file, name, path))
+    if len(names) > MOST_TRAJECTORIES:
+        raise DataError(f"{path}: has more than {MOST_TRAJECTORIES} trajectories; cut it into several sets.")
     if not names:
         raise DataError(f"{path}: has no trajectory; it must have groups 00000, 00001, ...: write or copy it again.")
     return names
@@ -286,21 +292,54 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except CConvError:
+    except DataError:
         raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        what = "is empty" if path.stat().st_size == 0 else f"is truncated or not HDF5 ({reason})"
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError) as error:
+        what = "is empty" if path.stat().st_size == 0 else f"is truncated or not HDF5 ({one_line(error)})"
         raise DataError(f"{path}: {what}; copy it again.") from error
 
 
+def _is_trajectory(file: h5py.File, name: str, path: Path) -> bool:
+    if name.isprintable() and len(name) <= LONGEST_NAME:
+        return isinstance(linked(file, name, str(path)), h5py.Group)
+    raise DataError(f"{path}: a group is named {one_line(name)!r}; name trajectories 00000, 00001, ...")
+
+
+def _has(group: h5py.Group, key: str) -> bool:
+    """Whether there is such a link; nothing is followed."""
+    return group.get(key, getlink=True) is not None
+
+
 def _member(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
-    stored = linked_member(group, key, file)
+    """A data set that may be read: it was written, lies in the folder and fits into memory."""
+    stored = linked(group, key, f"{file}: trajectory {name}")
     if not isinstance(stored, h5py.Dataset):
-        found = ", ".join(group)[:200] or "nothing"
+        found = one_line(", ".join(itertools.islice(group, 20))) or "nothing"
         raise DataError(f"{file}: trajectory {name}: `{key}` is missing (found: {found}); write it or copy it again.")
-    check_readable(stored, file, f"trajectory {name}", key)
+    check_stored(stored, file.parent, f"{file}: trajectory {name}: `{key}`")
     return stored
+
+
+def _types(group: h5py.Group, file: Path, name: str, particles: int | str) -> Tensor:
+    """Types of the particles (N,), all of them known and at least one of them fluid."""
+    types = _required(group, "particle_type", file, name, (particles,)).long()
+    known = [int(kind) for kind in ParticleType]
+    values, counts = types.unique(return_counts=True)
+    unknown = [
+        f"{value} ({count} times)"
+        for value, count in zip(values.tolist(), counts.tolist(), strict=True)
+        if value not in known
+    ]
+    if unknown:
+        raise DataError(
+            f"{file}: trajectory {name}: `particle_type` has unknown values {one_line(', '.join(unknown))}; "
+            f"known are {', '.join(f'{int(kind)} ({kind.name.lower()})' for kind in ParticleType)}: correct them."
+        )
+    if ParticleType.FLUID not in types:
+        raise DataError(
+            f"{file}: trajectory {name}: no particle is fluid (`particle_type` 0); there is nothing to learn."
+        )
+    return types
 
 
 def _required(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor:
@@ -311,7 +350,7 @@ def _required(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[i
 
 
 def _optional(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor | None:
-    return _required(group, key, file, name, shape) if key in group else None
+    return _required(group, key, file, name, shape) if _has(group, key) else None
 
 
 def _finite_frames(stored: h5py.Dataset, frames: slice, file: Path, name: str) -> Tensor:

@@ -1,168 +1,129 @@
-"""Members of HDF5 files that may come from anybody: nothing outside their folder is read, nothing too large is begun.
+"""Members of HDF5 files from strangers: links stay in the file, sizes are checked before anything is read."""
 
-HDF5 follows links to other files, reads raw bytes from any path, fills what was never written with zeros, and takes the
-size of an array from a few bytes of a header. Each member is checked for this before a value of it is read.
-"""
-
+import itertools
 import math
-import os
-import stat
 from pathlib import Path
 
 import h5py
 
-from cconv.errors import DataError, shown
+from cconv.data.limits import check_size, one_line
+from cconv.errors import DataError
 
-COMPRESSION = 1100  # declared bytes by stored ones, at most; gzip reaches 1032 for zeros
-SMALLEST = 2**20  # bytes that any array may have, whatever is stored
-DEEPEST_SOURCE = 8  # virtual arrays of virtual arrays
-SAME_FILE = "."
+DEEPEST = 8  # soft links or virtual data sets that lead to each other
 
 
-def linked_member(group: h5py.Group, key: str, file: Path) -> h5py.Group | h5py.Dataset | None:
-    """The group or array `key` of a group; None if there is none.
+def linked(group: h5py.Group, key: str, place: str, depth: int = 0) -> h5py.Group | h5py.Dataset | None:
+    """The member `key` of a group, or None if there is none.
 
-    Args:
-        group: Where to look.
-        key: Name of the member.
-        file: The file that was opened; what its links reach must lie in its folder.
+    Soft links within the file are followed. External links are not, since they can read any file of the user.
 
     Raises:
-        DataError: If a link leads nowhere or out of the folder.
+        DataError: If a link leaves the file or leads nowhere.
     """
     link = group.get(key, getlink=True)
-    if link is None:
-        return None
+    if link is None or isinstance(link, h5py.HardLink):
+        return None if link is None else group[key]
+    what = f"{place}: `{one_line(key)}`"
     if isinstance(link, h5py.ExternalLink):
-        _check_inside(file, link.filename, f"{shown(key)} is a link to")
-    try:
-        member = group[key]
-    except KeyError as error:
         raise DataError(
-            f"{file}: {shown(key)} is a link that leads nowhere ({error}); copy what it links to."
-        ) from error
-    _check_inside(file, member.file.filename, f"{shown(key)} links to")
-    return member
+            f"{what} is a link to another file ({one_line(link.filename)}), which is not followed; "
+            "copy what it names into this file (h5copy)."
+        )
+    target = group.file if link.path.startswith("/") else group
+    for part in filter(lambda part: part not in ("", "."), link.path.split("/")):
+        target = linked(target, part, place, depth + 1) if isinstance(target, h5py.Group) and depth < DEEPEST else None
+    if target is None:
+        raise DataError(f"{what} is a link to {one_line(link.path)}, which leads nowhere; write it again.")
+    return target
 
 
-def check_readable(stored: h5py.Dataset, file: Path, place: str, key: str) -> None:
-    """Check that an array holds numbers which were written, are of a size that can be, and can be decoded.
+def check_stored(dataset: h5py.Dataset, folder: Path, place: str, depth: int = 0) -> None:
+    """Raise `DataError` unless a data set holds numbers, lies in `folder`, fits into memory and was written whole.
 
     Args:
-        stored: The array.
-        file: Its file.
-        place: Where it is, for messages, such as "trajectory 00000".
-        key: Its name.
-
-    Raises:
-        DataError: With file, place, key and what is wrong.
+        dataset: What is about to be read; nothing of it is read here.
+        folder: Folder of the data. Sources of virtual data sets may be files in it.
+        place: File, trajectory and member, for messages.
+        depth: How many virtual data sets led here.
     """
-    where = f"{file}: {place}: `{key}`"
-    kind = stored.dtype.kind
-    if kind not in "fiu" or stored.dtype.itemsize > 8:
-        raise DataError(f"{where} must hold numbers of at most 64 bits, got {stored.dtype}; write it again.")
-    if stored.shape is None:
-        raise DataError(f"{where} is empty; write it again.")
-    _check_filters(stored, where)
-    _check_sources(stored, file, where)
-    _check_size(stored, file, where)
-    _check_written(stored, where)
+    _check_type(dataset, place)
+    _check_filters(dataset, place)
+    if dataset.external:
+        named = one_line(dataset.external[0][0])
+        raise DataError(f"{place} is kept outside the file ({named}), which is not read; write it into the file.")
+    if dataset.is_virtual:
+        _check_sources(dataset, folder, place, depth)
+        return
+    check_size(dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), place)
+    _check_written(dataset, place)
 
 
-def _check_inside(file: Path, target: str, what: str) -> None:
-    """Raise `DataError` unless a file that another one names is a regular one in its folder, or below."""
-    folder = file.parent.resolve()
-    path = (folder / target).resolve()
-    if not path.is_relative_to(folder) and path != file.resolve():
-        raise DataError(
-            f"{file}: {what} {shown(target)}, outside the data's folder; copy what it links to into the file."
-        )
-    if not path.exists() or not stat.S_ISREG(path.stat().st_mode):
-        raise DataError(f"{file}: {what} {shown(target)}, which is not there; copy it to the data's folder.")
+def _check_type(dataset: h5py.Dataset, place: str) -> None:
+    kind, size = dataset.dtype.kind, dataset.dtype.itemsize
+    if dataset.shape is None or dataset.shape == () or dataset.size == 0:
+        raise DataError(f"{place} must be an array with values, got shape {dataset.shape}; write it again.")
+    if kind not in "fiu" or size > 8:
+        hint = "convert it to float64" if kind == "f" else "write it again"
+        raise DataError(f"{place} must be numbers of at most 64 bits, got {one_line(dataset.dtype)}; {hint}.")
 
 
-def _check_filters(stored: h5py.Dataset, where: str) -> None:
-    properties = stored.id.get_create_plist()
-    for number in range(properties.get_nfilters()):
-        code, _, _, name = properties.get_filter(number)
-        if not h5py.h5z.filter_avail(code):
-            label = shown(name.decode(errors="replace"))
+def _check_filters(dataset: h5py.Dataset, place: str) -> None:
+    settings = dataset.id.get_create_plist()
+    for index in range(settings.get_nfilters()):
+        number = settings.get_filter(index)[0]
+        if not h5py.h5z.filter_avail(number):
             raise DataError(
-                f"{where} is compressed by filter {code} ({label}), which is not installed; install its plugin or "
-                "write the data with gzip."
+                f"{place} is compressed by HDF5 filter {number}, which is not installed; "
+                "write it again with gzip (h5repack -f GZIP=4)."
             )
 
 
-def _check_sources(stored: h5py.Dataset, file: Path, where: str, depth: int = 0) -> None:
-    """Check the files that an array's values lie in, where that is not its own."""
-    if stored.external:
+def _check_sources(dataset: h5py.Dataset, folder: Path, place: str, depth: int) -> None:
+    """Check what a virtual data set is put together from."""
+    sources, size = dataset.virtual_sources(), dataset.size * dataset.dtype.itemsize
+    covered = sum(source.vspace.get_select_npoints() for source in sources)
+    if covered < dataset.size:
+        raise DataError(f"{place} is virtual and {dataset.size - covered} of its values have no source; copy it again.")
+    for source in {(source.file_name, source.dset_name) for source in sources}:
+        check_size(size, _source_bytes(source, Path(dataset.file.filename), folder, place, depth), place)
+
+
+def _source_bytes(source: tuple[str, str], file: Path, folder: Path, place: str, depth: int) -> int:
+    """Stored bytes of a checked source of a virtual data set."""
+    name, member = source
+    path = (file if name == "." else file.parent / name).resolve()
+    if depth >= DEEPEST or not path.is_relative_to(folder.resolve()):
         raise DataError(
-            f"{where} keeps its values in other files ({shown(stored.external[0][0])}); write it as a whole."
+            f"{place} is read from {one_line(name)}, outside of its folder; write its values into the file."
         )
-    if not stored.is_virtual:
+    if not path.is_file():
+        raise DataError(f"{place} is read from {one_line(name)}, which is missing; copy that file as well.")
+    with h5py.File(path, "r") as opened:
+        target = opened
+        for part in filter(None, member.split("/")):
+            target = linked(target, part, str(path)) if isinstance(target, h5py.Group) else None
+        if not isinstance(target, h5py.Dataset):
+            raise DataError(f"{place} is read from {one_line(name)}, which has no `{one_line(member)}`; copy it again.")
+        check_stored(target, folder, f"{path}: `{one_line(member)}`", depth + 1)
+        return target.size * target.dtype.itemsize
+
+
+def _check_written(dataset: h5py.Dataset, place: str) -> None:
+    if dataset.chunks is None:
+        if dataset.id.get_storage_size() < dataset.size * dataset.dtype.itemsize:
+            raise DataError(f"{place} was made but never written (it would read as zeros); write it again.")
         return
-    if depth == DEEPEST_SOURCE:
-        raise DataError(f"{where} is a virtual array of virtual arrays, {depth} deep; write it as a whole.")
-    for source in stored.virtual_sources():
-        if "%" in source.file_name or "%" in source.dset_name:
-            raise DataError(f"{where} takes its values from files of a pattern; write it as a whole.")
-        if source.file_name == SAME_FILE:
-            _check_source(stored.file, source.dset_name, file, where, depth)
-        else:
-            _check_inside(file, source.file_name, f"{where} takes its values from")
-            with h5py.File(file.parent / source.file_name, "r") as other:
-                _check_source(other, source.dset_name, file, where, depth)
-
-
-def _check_source(other: h5py.File, name: str, file: Path, where: str, depth: int) -> None:
-    member = other.get(name)
-    if not isinstance(member, h5py.Dataset):
-        raise DataError(f"{where} takes its values from {shown(name)}, which is not there; write it as a whole.")
-    _check_inside(file, member.file.filename, f"{where} takes its values from")
-    _check_sources(member, file, where, depth + 1)
-
-
-def _check_size(stored: h5py.Dataset, file: Path, where: str) -> None:
-    """Raise `DataError` unless an array's size goes with the bytes that are stored for it, and with the memory."""
-    size = math.prod(stored.shape) * stored.dtype.itemsize
-    on_disk = getattr(os.stat(file), "st_blocks", math.inf) * 512
-    held = on_disk if stored.is_virtual else min(stored.id.get_storage_size(), on_disk)
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if size > SMALLEST and size > COMPRESSION * held:
+    wanted = math.prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    if dataset.id.get_num_chunks() < wanted:
         raise DataError(
-            f"{where} of shape {stored.shape} claims {size:,} bytes, and the file holds {held:,} of them; write it "
-            "again."
-        )
-    if size > memory / 2:
-        raise DataError(
-            f"{where} has {size:,} bytes, more than half of this machine's memory ({memory:,}); split the trajectory."
+            f"{place} was made but not written from frame {_first_unwritten(dataset)} on "
+            "(it would read as zeros); write it again or cut the trajectory there."
         )
 
 
-def _check_written(stored: h5py.Dataset, where: str) -> None:
-    """Raise `DataError` if any part of an array was allocated and never written: it would be read as zeros."""
-    if stored.is_virtual or 0 in stored.shape:
-        return
-    if stored.chunks is None:
-        if stored.id.get_storage_size() == 0:
-            raise DataError(f"{where} was never written, from frame 0 on; write it again.")
-        return
-    grid = [math.ceil(length / chunk) for length, chunk in zip(stored.shape, stored.chunks, strict=True)]
-    if stored.id.get_num_chunks() >= math.prod(grid):
-        return
+def _first_unwritten(dataset: h5py.Dataset) -> int:
+    """Index along the first axis of the first chunk that is not in the file."""
     written: set[tuple[int, ...]] = set()
-    stored.id.chunk_iter(lambda chunk: written.add(chunk.chunk_offset))
-    missing = next(offset for offset in _offsets(grid, stored.chunks) if offset not in written)
-    raise DataError(
-        f"{where} was never written at frame {missing[0]}, and would be read as zeros; cut it there or write it again."
-    )
-
-
-def _offsets(grid: list[int], chunks: tuple[int, ...]):
-    """First index of each chunk, the last axis fastest."""
-    for number in range(math.prod(grid)):
-        offset = []
-        for length in reversed(grid):
-            number, place = divmod(number, length)
-            offset.append(place)
-        yield tuple(place * chunk for place, chunk in zip(reversed(offset), chunks, strict=True))
+    dataset.id.chunk_iter(lambda chunk: written.add(tuple(chunk.chunk_offset)))
+    starts = (range(0, length, chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    return next(start[0] for start in itertools.product(*starts) if start not in written)

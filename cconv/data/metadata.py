@@ -10,13 +10,16 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from cconv.data.source import STORED, Given
+from cconv.data.limits import one_line
+from cconv.data.source import LARGEST, SMALLEST, STORED, Given
 from cconv.data.trajectory import Scene
 from cconv.domain import Box
 from cconv.errors import DataError, ShapeError
 
 METADATA = "metadata.json"
 OWN_KEY = "cconv"
+MOST_BYTES = 2**20
+MOST_LINES = 50  # of what is missing
 DIFFERENCES = "central differences of positions"
 DAM_BREAK_CASES = ("db", "dam", "dam break")
 OVERRIDES = {"mass": "masses", "particle_spacing": "particle spacing", "frame_dt": "frame dt", "force": "force"}
@@ -28,10 +31,13 @@ def load_metadata(file: Path) -> dict:
     Raises:
         DataError: If it is not a JSON object.
     """
+    if not file.is_file() or file.stat().st_size > MOST_BYTES:
+        raise DataError(f"{file}: must be a file of at most {MOST_BYTES} bytes; correct it or copy it again.")
     try:
         metadata = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file}: is not valid JSON ({error}); correct it or copy it again.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        what = "nested too deeply" if isinstance(error, RecursionError) else one_line(error)
+        raise DataError(f"{file}: is not valid JSON ({what}); correct it or copy it again.") from error
     if not isinstance(metadata, dict) or not isinstance(metadata.get(OWN_KEY, {}), dict):
         raise DataError(f"{file}: must be a JSON object, and so must its `{OWN_KEY}`; correct it or copy it again.")
     return metadata
@@ -64,16 +70,16 @@ def scene_from_metadata(
         DataError: If a key is missing or its value cannot be.
         ConfigError: If the given force does not have one number an axis.
     """
-    dim = _value(metadata, "dim", file, lambda value: value in (1, 2, 3), "1, 2 or 3")
+    dim = _value(metadata, "dim", file, lambda value: type(value) is int and value in (1, 2, 3), "1, 2 or 3")
     spacing = given.particle_spacing or _positive(metadata, "dx", file)
-    frame_dt = given.frame_dt or _positive(metadata, "dt", file) * _positive(metadata, "write_every", file)
-    own = metadata.get(OWN_KEY) or _deduced(metadata, file.parent, dim, stores_velocity, stores_mass)
-    mass_source = str(own.get("mass_source", STORED)) if stores_mass else default_mass_source(spacing, dim)
+    frame_dt = given.frame_dt or _frame_dt(metadata, file)
+    own = metadata.get(OWN_KEY) or _deduced(metadata, file, dim, stores_velocity, stores_mass)
+    mass_source = one_line(own.get("mass_source", STORED)) if stores_mass else default_mass_source(spacing, dim)
     force = given.checked_force(dim) or _own(own, "force", file, lambda value: _is_vector(value, dim), f"{dim} numbers")
     overridden = tuple(f"{topic}:" for name, topic in OVERRIDES.items() if getattr(given, name) is not None)
     missing = _own(own, "missing", file, lambda value: isinstance(value, list), "a list of lines") or []
     return Scene(
-        name=str(own.get("name", file.parent.name)),
+        name=one_line(own.get("name", file.parent.name)),
         dim=dim,
         particle_spacing=spacing,
         frame_dt=frame_dt,
@@ -82,7 +88,7 @@ def scene_from_metadata(
         has_boundary=has_boundary,
         velocity_source=STORED if stores_velocity else DIFFERENCES,
         mass_source=f"given: {given.mass:g}" if given.mass else mass_source,
-        missing=tuple(line for line in map(str, missing) if not line.startswith(overridden)),
+        missing=tuple(line for line in map(one_line, missing[:MOST_LINES]) if not line.startswith(overridden)),
     )
 
 
@@ -125,27 +131,29 @@ def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> d
     }
 
 
-def _deduced(metadata: Mapping, folder: Path, dim: int, stores_velocity: bool, stores_mass: bool) -> dict:
+def _deduced(metadata: Mapping, file: Path, dim: int, stores_velocity: bool, stores_mass: bool) -> dict:
     """What our key would hold for a LagrangeBench set, which has none: name, force and what is missing."""
-    force, force_line = _external_force(metadata, folder, dim)
+    force, force_line = _external_force(metadata, file, dim)
     missing = {
         "velocities": None if stores_velocity else f"not stored; {DIFFERENCES}",
         "masses": None if stores_mass else f"not stored; rest density 1 times dx^{dim}",
         "force": force_line,
     }
     lines = [f"{topic}: {line}" for topic, line in missing.items() if line]
-    return {"name": folder.name, "force": force, "missing": lines}
+    return {"name": file.parent.name, "force": force, "missing": lines}
 
 
-def _external_force(metadata: Mapping, folder: Path, dim: int) -> tuple[list[float] | None, str | None]:
+def _external_force(metadata: Mapping, file: Path, dim: int) -> tuple[list[float] | None, str | None]:
     """Constant force, and what cannot be said about it. Gravity of a dam break acts on axis 1."""
-    magnitude = metadata.get("g_ext_magnitude") or 0.0
+    magnitude = 0.0
+    if metadata.get("g_ext_magnitude") is not None:
+        magnitude = _value(metadata, "g_ext_magnitude", file, _is_number, f"a number of at most {LARGEST:g}")
     case = str(metadata.get("case", "")).lower()
     if magnitude and case in DAM_BREAK_CASES and dim > 1:
         return [-float(magnitude) if axis == 1 else 0.0 for axis in range(dim)], None
     if magnitude:
         return None, f"of magnitude {magnitude:g} acts, but its direction is not stored (it may depend on position)"
-    if (folder / "force.py").exists():
+    if (file.parent / "force.py").exists():
         return None, "given by force.py, which is never run"
     return None, None
 
@@ -157,8 +165,8 @@ def _box(metadata: Mapping, dim: int, file: Path) -> Box:
         metadata,
         "periodic_boundary_conditions",
         file,
-        lambda value: isinstance(value, list) and len(value) >= dim,
-        f"at least {dim} truth values",
+        lambda value: isinstance(value, list) and len(value) >= dim and all(type(flag) is bool for flag in value),
+        f"at least {dim} truth values (true or false)",
     )
     try:
         return Box(*zip(*bounds, strict=True), tuple(map(bool, periodic[:dim])))
@@ -170,7 +178,7 @@ def _value(metadata: Mapping, key: str, file: Path, fits: Callable[[object], boo
     if key not in metadata:
         raise DataError(f"{file}: key `{key}` is missing; add it ({wanted}).")
     if not fits(metadata[key]):
-        raise DataError(f"{file}: `{key}` must be {wanted}, got {metadata[key]!r}; correct it.")
+        raise DataError(f"{file}: `{key}` must be {wanted}, got {one_line(repr(metadata[key]))}; correct it.")
     return metadata[key]
 
 
@@ -178,16 +186,24 @@ def _own(own: Mapping, key: str, file: Path, fits: Callable[[object], bool], wan
     if own.get(key) is None:
         return None
     if not fits(own[key]):
-        raise DataError(f"{file}: `{OWN_KEY}.{key}` must be {wanted}, got {own[key]!r}; correct it.")
+        raise DataError(f"{file}: `{OWN_KEY}.{key}` must be {wanted}, got {one_line(repr(own[key]))}; correct it.")
     return own[key]
 
 
+def _frame_dt(metadata: Mapping, file: Path) -> float:
+    frame_dt = _positive(metadata, "dt", file) * _positive(metadata, "write_every", file)
+    if not SMALLEST <= frame_dt <= LARGEST:
+        raise DataError(f"{file}: `dt` times `write_every` must be {SMALLEST:g} to {LARGEST:g}, got {frame_dt:g}.")
+    return frame_dt
+
+
 def _positive(metadata: Mapping, key: str, file: Path) -> float:
-    return _value(metadata, key, file, lambda value: _is_number(value) and value > 0, "a positive number")
+    wanted = f"a positive number from {SMALLEST:g} to {LARGEST:g}"
+    return float(_value(metadata, key, file, lambda value: _is_number(value) and value >= SMALLEST, wanted))
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def _is_vector(value: object, length: int) -> bool:

@@ -1,6 +1,5 @@
 """What every reader of particle data offers, what the user may say about data, and the checks that readers share."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -14,6 +13,7 @@ from cconv.errors import ConfigError, DataError
 
 SPLITS = ("train", "valid", "test")
 STORED = "stored"
+SMALLEST, LARGEST = 1e-12, 1e12  # of a length, time, mass or acceleration, whatever its unit; their powers fit float32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class Given:
         force: Constant external acceleration, D numbers.
 
     Raises:
-        ConfigError: If a mass, spacing or time is not positive and finite, or a force is not finite.
+        ConfigError: If a mass, spacing or time is not positive, or a number is beyond `SMALLEST` and `LARGEST`.
     """
 
     mass: float | None = None
@@ -38,12 +38,12 @@ class Given:
     def __post_init__(self):
         for name in ("mass", "particle_spacing", "frame_dt"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"`{name}` must be positive and finite, got {value}.")
+            if value is not None and not SMALLEST <= value <= LARGEST:
+                raise ConfigError(f"`{name}` must be positive, from {SMALLEST:g} to {LARGEST:g}, got {value}.")
         if self.force is not None:
             object.__setattr__(self, "force", tuple(float(value) for value in self.force))
-            if not all(math.isfinite(value) for value in self.force):
-                raise ConfigError(f"`force` must be finite, got {self.force}.")
+            if not all(abs(value) <= LARGEST for value in self.force):
+                raise ConfigError(f"`force` must be finite, at most {LARGEST:g}, got {self.force}.")
 
     def checked_force(self, dim: int) -> tuple[float, ...] | None:
         """The force, after a check that it has one number an axis."""
@@ -84,14 +84,15 @@ def uniform_masses(mass: float, like: Tensor) -> Tensor:
 
 
 def as_tensor(array: np.ndarray) -> Tensor:
-    """A tensor of its own memory, in native byte order; float32 and float64 stay as they are."""
-    return torch.from_numpy(np.array(array, dtype=array.dtype.newbyteorder("="), order="C"))
+    """A tensor of its own memory, in native byte order; float32 and float64 stay as they are, float16 is widened."""
+    dtype = np.dtype("f4") if array.dtype.kind == "f" and array.dtype.itemsize == 2 else array.dtype.newbyteorder("=")
+    return torch.from_numpy(np.array(array, dtype=dtype, order="C"))
 
 
 def check_array(array: object, shape: tuple[int | str, ...], file: Path, place: str, key: str) -> None:
     """Raise `DataError` unless `array` is a numeric array of `shape`; strings in `shape` match any length."""
     wanted = ", ".join(str(axis) for axis in shape)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         came = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"{file}: {place}: `{key}` must be numbers of shape ({wanted}), got {came}; write it again.")
     fits = array.ndim == len(shape) and all(

@@ -1,0 +1,51 @@
+"""How much foreign data may take: memory, and text that a terminal shows."""
+
+import psutil
+
+from cconv.errors import DataError
+
+MEMORY_SHARE = 0.5  # of what is available; samples and graphs need the rest
+LARGEST_RATIO = 1000  # uncompressed to stored bytes; deflate cannot exceed 1032
+SMALL = 64 * 2**20  # bytes that are read whatever their ratio
+LONGEST_TEXT = 200
+
+
+def check_size(size: int, stored: int, place: str) -> None:
+    """Raise `DataError` if what is stored in `stored` bytes would take `size` bytes that no honest file of it needs.
+
+    Args:
+        size: Bytes once it is read.
+        stored: Bytes in the file.
+        place: File and member, for the message.
+    """
+    room = memory_limit()
+    if size > room:
+        raise DataError(
+            f"{place} takes {_readable(size)}, more than {_readable(room)}, half of the memory that is free; "
+            "cut it into shorter trajectories."
+        )
+    if size > SMALL and size > LARGEST_RATIO * stored:
+        raise DataError(
+            f"{place} claims {_readable(size)} but only {_readable(stored)} are stored; it was never written: "
+            "write it again."
+        )
+
+
+def memory_limit() -> int:
+    """Bytes that one piece of data may take now."""
+    return int(MEMORY_SHARE * psutil.virtual_memory().available)
+
+
+def one_line(value: object, longest: int = LONGEST_TEXT) -> str:
+    """Foreign text as one printable line of at most `longest` characters; control characters are shown as ``?``."""
+    text = str(value)
+    shown = "".join(character if character.isprintable() else "?" for character in text[:longest])
+    return shown + (f"... ({len(text)} characters)" if len(text) > longest else "")
+
+
+def _readable(size: int) -> str:
+    for unit in ("bytes", "KB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"
