@@ -48,7 +48,7 @@ class RungTable:
         before = list(errors.values())[: list(errors).index(trial)]
         if updates == self.rungs[-1] or not before:
             return True
-        return error <= np.percentile(before, 100 * self._quantile)
+        return bool(error <= np.percentile(before, 100 * self._quantile))
 
     def passed(self) -> list[dict]:
         """How many went on from each rung but the last: "updates", "trials" and "passed".
