@@ -184,7 +184,7 @@ def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     ]  # fmt: skip
     running = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     unfinished = tmp_path / "a.unfinished"
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while len(list(unfinished.glob("*.safetensors"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(running.pid, signal.SIGKILL)
@@ -276,14 +276,14 @@ def test_workers_end_with_their_parent_and_at_an_interrupt(tmp_path):
     ]  # fmt: skip
     for told in (signal.SIGINT, signal.SIGKILL):
         running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE
         while len(_children(running.pid)) < 3 and time.monotonic() < deadline:  # two workers, one resource tracker
             time.sleep(0.05)
         time.sleep(2)
         children = _children(running.pid)
         running.send_signal(told)
         running.wait(timeout=PATIENCE)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + PATIENCE
         while any(Path(f"/proc/{child}/cmdline").exists() for child in children) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert len(children) >= 2
