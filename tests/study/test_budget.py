@@ -54,7 +54,10 @@ def test_a_finalist_whose_error_was_still_falling_is_named_unless_a_larger_budge
         {"id": "steep", "updates": 162, "fall_at_the_end": 0.3},
     ]
     found = {
-        "baseline": {"points": [point("baseline", 162, 0.5), point("baseline_after_600", 600, 0.4)], "still_falling": False}
+        "baseline": {
+            "points": [point("baseline", 162, 0.5), point("baseline_after_600", 600, 0.4)],
+            "still_falling": False,
+        }
     }
     words = budget_words(entries, found, 0.05)
     assert "steep (by 30% in the last quarter of its 162 updates)" in words
