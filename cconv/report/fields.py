@@ -3,6 +3,7 @@
 Neither Ray nor torch is imported.
 """
 
+import io
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,7 +94,8 @@ def error_distribution_chart(explanations: Mapping[str, Explanation], baseline: 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # From memory, as numpy leaves a file open that it cannot read.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
     except (OSError, EOFError, ValueError, BadZipFile, zlib.error) as error:
         raise DataError(f"{path}: no arrays of a model's explanation ({error}); delete or restore it.") from error
