@@ -70,8 +70,8 @@ def test_old_summaries_have_a_report(run):
 
 def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
     assert sections(whole_report) == [
-        "answer", "chart", "finalists", "sure", "budget", "stability", "cost", "search", "importance", "ablation", "learned",
-        "provenance", "glossary",
+        "answer", "chart", "finalists", "sure", "budget", "stability", "cost", "search", "importance", "ablation",
+        "learned", "provenance", "glossary",
     ]  # fmt: skip
     for figure in (
         "7.52 (7.21 to 7.93)",
