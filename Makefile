@@ -1,5 +1,6 @@
 # make study   environment, data, the quick study, report
 # make test    environment, whole test suite
+# make test-slow   a thousand damaged inputs
 # make check   environment, lint and format
 # make data    environment and the data of the quick study, made by the SPH solver
 
@@ -9,13 +10,16 @@ STUDY ?= experiments/quick.toml
 RUN ?= runs/$(basename $(notdir $(STUDY)))
 DATA := runs/data/dam_break_2d
 
-.PHONY: study test check data clean
+.PHONY: study test test-slow check data clean
 
 study: $(VENV)/.installed $(DATA)/metadata.json
 	$(VENV)/bin/cconv study run $(STUDY) --data $(DATA) --out $(RUN) --overwrite
 
 test: $(VENV)/.installed
 	$(VENV)/bin/pytest
+
+test-slow: $(VENV)/.installed
+	$(VENV)/bin/pytest -m slow
 
 check: $(VENV)/.installed
 	$(VENV)/bin/ruff format --check .
