@@ -15,6 +15,7 @@ from pathlib import Path
 
 from ray._private import ray_constants
 from ray._raylet import AuthenticationTokenLoader, Config
+from ray.exceptions import AuthenticationError
 
 from cconv.errors import ConfigError
 
@@ -116,13 +117,20 @@ def on_loopback_alone() -> Iterator[None]:
 
 def check_token_of_cluster(address: str) -> None:
     """Raise `ConfigError` unless the user has a token for the cluster at `address`."""
-    AuthenticationTokenLoader.instance().reset_cache()
-    if not AuthenticationTokenLoader.instance().has_token(ignore_auth_mode=True):
+    if not _has_token():
         raise ConfigError(
             f"--address {address}: no token for this cluster, and one without a token runs anybody's code; make one "
             "with `(umask 077; ray get-auth-token --generate)`, copy ~/.ray/auth_token to every node (or name the file in "
             "RAY_AUTH_TOKEN_PATH), start the nodes with RAY_AUTH_MODE=token."
         )
+
+
+def _has_token() -> bool:
+    AuthenticationTokenLoader.instance().reset_cache()
+    try:
+        return AuthenticationTokenLoader.instance().has_token(ignore_auth_mode=True)
+    except AuthenticationError:  # the file that the environment names is not there or empty
+        return False
 
 
 def _made_folder() -> Path:

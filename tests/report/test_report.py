@@ -65,13 +65,13 @@ def test_old_summaries_have_a_report(run):
     assert summary["recommended"]["reason"].split(" (")[0] in text
     for entry in summary["finalists"]:
         assert f"{entry['test']['normalized_mse']:.4g}" in text
-    assert sections(text) == ["answer", "chart", "finalists", "cost", "search", "provenance", "glossary"]
+    assert sections(text) == ["answer", "chart", "finalists", "budget", "cost", "search", "provenance", "glossary"]
 
 
 def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
     assert sections(whole_report) == [
-        "answer", "chart", "finalists", "sure", "stability", "cost", "search", "importance", "ablation", "learned",
-        "provenance", "glossary",
+        "answer", "chart", "finalists", "sure", "budget", "stability", "cost", "search", "importance", "ablation",
+        "learned", "provenance", "glossary",
     ]  # fmt: skip
     for figure in (
         "95 % interval 7.21 to 7.93",
