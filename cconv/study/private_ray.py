@@ -120,7 +120,7 @@ def check_token_of_cluster(address: str) -> None:
     if not _has_token():
         raise ConfigError(
             f"--address {address}: no token for this cluster, and one without a token runs anybody's code; make one "
-            "with `(umask 077; ray get-auth-token --generate)`, copy ~/.ray/auth_token to every node (or name the file in "
+            "with `(umask 077; ray get-auth-token --generate)`, copy ~/.ray/auth_token to every node (or name it in "
             "RAY_AUTH_TOKEN_PATH), start the nodes with RAY_AUTH_MODE=token."
         )
 
