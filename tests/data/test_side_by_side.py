@@ -1,31 +1,15 @@
 """Generators in processes of their own: all run, what they raise arrives, nothing of theirs has a name in memory."""
 
 import os
-import signal
 from pathlib import Path
 
 import pytest
+from generators import die, refuse, write
 
 from cconv.data.side_by_side import side_by_side
 from cconv.errors import ConfigError, DataError
 
 SHARED_MEMORY = Path("/dev/shm")
-
-
-def write(folder, number, steps):
-    for _ in range(steps):
-        yield
-    (folder / str(number)).write_text(f"{os.getpid()}")
-
-
-def refuse():
-    yield
-    raise ConfigError("no such thing")
-
-
-def die():
-    yield
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_every_call_runs_to_its_end_in_as_many_processes_and_each_yield_is_told(tmp_path):
