@@ -83,8 +83,7 @@ def _work(connection: Connection, generator: Callable, threads: int) -> None:
     torch.set_num_threads(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while True:
-        call = connection.recv()
+    while (call := _next_call(connection)) is not None:
         try:
             for _ in generator(*call):
                 connection.send((False, None))
@@ -92,6 +91,14 @@ def _work(connection: Connection, generator: Callable, threads: int) -> None:
             connection.send((True, error))
         else:
             connection.send((True, None))
+
+
+def _next_call(connection: Connection) -> tuple | None:
+    """The next call's arguments; None where the parent has no more and let its end of the pipe go."""
+    try:
+        return connection.recv()
+    except (EOFError, ConnectionError):
+        return None
 
 
 def _end_with_parent() -> None:

@@ -12,13 +12,14 @@ from cconv.errors import ConfigError, DataError
 SHARED_MEMORY = Path("/dev/shm")
 
 
-def test_every_call_runs_to_its_end_in_as_many_processes_and_each_yield_is_told(tmp_path):
+def test_every_call_runs_to_its_end_in_as_many_processes_and_each_yield_is_told(tmp_path, capfd):
     calls = [(tmp_path, number, number) for number in range(5)]
     told = sum(1 for _ in side_by_side(write, calls, 2))
     assert told == sum(range(5))
     processes = {(tmp_path / str(number)).read_text() for number in range(5)}
     assert len(processes) == 2
     assert str(os.getpid()) not in processes
+    assert not capfd.readouterr().err  # a worker that runs out of calls ends without a word
 
 
 def test_what_a_call_raises_arrives():
