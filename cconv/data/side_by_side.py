@@ -41,9 +41,9 @@ def side_by_side(generator: Callable[..., Iterable], calls: Sequence[tuple], wor
             for connection in wait(busy):
                 if not _received(connection):
                     yield
-                elif (call := next(waiting, None)) is not None:
-                    connection.send(call)
-                else:
+                    continue
+                connection.send(call := next(waiting, None))
+                if call is None:
                     busy.remove(connection)
     except (EOFError, ConnectionError) as error:
         raise DataError(
@@ -79,11 +79,11 @@ def _received(connection: Connection) -> bool:
 
 
 def _work(connection: Connection, generator: Callable, threads: int) -> None:
-    """Run calls as they come, and say so at each thing that they yield and at their end."""
+    """Run calls as they come, until None comes; say so at each thing that they yield and at their end."""
     torch.set_num_threads(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while (call := _next_call(connection)) is not None:
+    for call in iter(connection.recv, None):
         try:
             for _ in generator(*call):
                 connection.send((False, None))
@@ -91,14 +91,6 @@ def _work(connection: Connection, generator: Callable, threads: int) -> None:
             connection.send((True, error))
         else:
             connection.send((True, None))
-
-
-def _next_call(connection: Connection) -> tuple | None:
-    """The next call's arguments; None where the parent has no more and let its end of the pipe go."""
-    try:
-        return connection.recv()
-    except (EOFError, ConnectionError):
-        return None
 
 
 def _end_with_parent() -> None:
