@@ -146,9 +146,11 @@ def inspect(
     frame_dt: FrameDt = None,
     force: Force = None,
 ) -> None:
-    """Show what a data set holds, what it lacks, and what was taken instead.
+    """Show what a data set holds, what it lacks, what was taken instead, and what does not make sense.
 
-    Every trajectory is read, so damaged files and exploded simulations are found here.
+    Every trajectory is read, so damaged files and exploded simulations are found here. What can be read but is no
+    simulation of a fluid is named with its frame and particle: masses of zero, frames never written, particles outside
+    the box or at the same place, a spacing that does not fit, axes that particles cross though they are not periodic.
     """
     from cconv.data.inspect import inspect_dataset
 
@@ -319,6 +321,7 @@ def _rows(facts: dict) -> list[tuple[str, str]]:
         ("speed", f"mean {facts['speed']['mean']:.4g}, largest {facts['speed']['max']:.4g}"),
         (f"neighbors within {neighbors['cutoff']:g}", "mean {mean:.1f}, {min} to {max}".format(**neighbors)),
         ("missing", "\n".join(facts["missing"]) or "nothing"),
+        ("suspicious", "\n".join(finding["line"] for finding in facts["findings"]) or "nothing found"),
         ("sha256", facts["sha256"]),
     ]
 

@@ -1,7 +1,7 @@
 """Progress of trials in the terminal: a live table, or plain lines where there is no terminal."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rich.console import Console, Group
@@ -49,6 +49,11 @@ class StudyDisplay:
     def __exit__(self, *exception) -> None:
         if self._live is not None:
             self._live.stop()
+
+    def on_data(self, findings: Sequence[str]) -> None:
+        """Print a line for everything that does not make sense."""
+        for finding in findings:
+            self.console.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
         """Begin a stage with an empty table."""

@@ -218,6 +218,7 @@ def report(path: RunPath) -> None:
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
+    from cconv.data.plausibility import dataset_findings
     from cconv.study.config import load_study
     from cconv.study.problem import load_problem, open_study_data, with_data_path
 
@@ -227,4 +228,6 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
     dataset = open_study_data(config.data, config.seeds.data)
+    for finding in dataset_findings(dataset, show_progress):
+        errors.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
     return config, load_problem(config, dataset, show_progress), dataset

@@ -1,14 +1,19 @@
-"""What a data set holds, as plain facts."""
+"""What a data set holds, as plain facts, and what of it does not make sense."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 
 import torch
+from scipy.spatial import cKDTree
 
 from cconv.data.dataset import Dataset
+from cconv.data.plausibility import first_of_each, trajectory_findings
 from cconv.data.trajectory import Frame, ParticleType, Trajectory
 from cconv.domain import Box
+from cconv.errors import ConfigError
 from cconv.neighbors import radius_graph
+
+MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
 
 
 def inspect_dataset(
@@ -27,18 +32,19 @@ def inspect_dataset(
 
     Raises:
         DataError: If the data are damaged.
-        ConfigError: If the cutoff is not positive or exceeds half of a periodic axis.
+        ConfigError: If the cutoff is not positive, exceeds half of a periodic axis or holds far too many neighbours.
     """
     scene = dataset.scene
     cutoff = 2 * scene.particle_spacing if cutoff is None else cutoff
     collected = defaultdict(list)
-    splits = {}
+    splits, findings = {}, []
     for split, blocks in dataset.splits.items():
         splits[split] = {"trajectories": len(blocks), "frames": 0}
         for k in progress(range(len(blocks)), split):
             trajectory = dataset.trajectory(split, k)
             splits[split]["frames"] += len(trajectory)
             _collect(collected, trajectory, scene.box, cutoff)
+            findings += trajectory_findings(trajectory, scene)
     return {
         "path": str(dataset.path),
         "format": dataset.format,
@@ -67,6 +73,7 @@ def inspect_dataset(
             "max": max(collected["neighbors_max"]),
         },
         "missing": list(scene.missing),
+        "findings": [finding.as_dict() for finding in first_of_each(findings)],
     }
 
 
@@ -95,7 +102,19 @@ def _collect(collected: dict, trajectory: Trajectory, box: Box, cutoff: float) -
 def _fluid_neighbors(frame: Frame, box: Box, cutoff: float) -> torch.Tensor:
     """Number of other fluid particles within `cutoff` of each fluid particle, (N,)."""
     positions = frame.positions[frame.particle_types == ParticleType.FLUID]
+    _check_affordable(positions, cutoff)
     return radius_graph(positions, cutoff, box).row_splits.diff()
+
+
+def _check_affordable(positions: torch.Tensor, cutoff: float) -> None:
+    """Raise `ConfigError` if a cutoff, or the particle spacing that it was taken from, is far too large to count."""
+    tree = cKDTree(positions.double().numpy())
+    mean = tree.count_neighbors(tree, cutoff) / len(positions) if cutoff > 0 else 0.0
+    if mean > MOST_NEIGHBORS:
+        raise ConfigError(
+            f"`cutoff` {cutoff:g} holds {mean:.0f} neighbours a particle, at most {MOST_NEIGHBORS} are counted; give a "
+            "smaller --cutoff, or a --particle-spacing that fits, as it is twice that by default."
+        )
 
 
 def _range(values: list[int]) -> dict:

@@ -1,11 +1,14 @@
 """Who watches a study run."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 
 class Observer(Protocol):
-    """Sees a search as it runs; the command line draws it."""
+    """Sees a study as it runs; the command line draws it."""
+
+    def on_data(self, findings: Sequence[str]) -> None:
+        """The data were read; each line names something in them that does not make sense."""
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
         """A stage begins."""

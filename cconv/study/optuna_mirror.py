@@ -179,6 +179,9 @@ class OptunaMirror:
         for trial in self._study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
             self._study.tell(trial.number, state=TrialState.FAIL)
 
+    def on_data(self, findings: Sequence[str]) -> None:
+        """Nothing: Optuna knows no data."""
+
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
         """Nothing: all searches share the study."""
 

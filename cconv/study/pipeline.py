@@ -5,6 +5,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
+from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
 from cconv.evaluation.metrics import mean_predictor_error, normalized_mse
 from cconv.study.ablation import ablate
@@ -153,7 +154,10 @@ def _session(
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
     dataset = open_study_data(study.data, study.seeds.data)
-    run.write("environment.json", describe_environment(study, dataset))
+    findings = dataset_findings(dataset, progress)
+    observer.on_data([str(finding) for finding in findings])
+    described = describe_environment(study, dataset)
+    run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
         space = fixed(space, "boundary")  # nothing to search where there are no walls
