@@ -1,5 +1,6 @@
 """The command line: the only place that parses arguments and prints."""
 
+import os
 import sys
 from importlib.metadata import version
 from typing import Annotated
@@ -44,15 +45,26 @@ def _options(
 def main() -> None:
     """Run the command line; bad input ends in one line on stderr and exit status 2, a study without a result in 1."""
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except typer.TyperException as error:  # an option or argument that does not exist or cannot be
+        if message := " ".join(error.format_message().split()):  # else help was asked for, and printed
+            help_of = error.ctx.command_path if getattr(error, "ctx", None) else "cconv"
+            _print_refusal(f"{message.rstrip('.')}; see {help_of} --help.")
+        sys.exit(2)
     except CConvError as error:
-        errors.print(visible(f"cconv: {error}"), style="bold red", soft_wrap=True)
+        _print_refusal(str(error))
         sys.exit(1 if isinstance(error, StudyError) else 2)
+    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         remedy = "; make room, then `cconv study resume` goes on" if is_disk_full(error) else ""
-        line = f"cconv: {place}{error.strerror or str(error) or type(error).__name__}{remedy}"
-        errors.print(visible(line), style="bold red", soft_wrap=True)
+        _print_refusal(f"{place}{error.strerror or str(error) or type(error).__name__}{remedy}")
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _print_refusal(reason: str) -> None:
+    errors.print(visible(f"cconv: {reason}"), style="bold red", soft_wrap=True)

@@ -32,6 +32,7 @@ REST_DENSITY = 1000.0
 PARTICLE_SPACING = 0.05
 LARGEST_WINDOW = 2**31  # bytes that zstd looks back at most
 PIECE = 2**24  # bytes decompressed at a time
+MOST_OBJECTS = 2_000_000  # keys, values and items in a file; a frame has about sixty
 COPIES = 3  # of the content at the same time: bytes, decoded frames, stacked frames
 
 
@@ -230,7 +231,7 @@ def _count_frames(file: Path) -> int:
 def _load(file: Path) -> list[dict]:
     """All frames of a file."""
     try:
-        frames = msgpack.unpackb(_unpacked_bytes(file), raw=False, strict_map_key=False, object_hook=decode_array)
+        frames = _unpack(_unpacked_bytes(file))
     except DataError as error:
         raise DataError(f"{file}: {error}") from error
     except (OSError, zstandard.ZstdError, msgpack.UnpackException, ValueError, TypeError, MemoryError) as error:
@@ -238,6 +239,28 @@ def _load(file: Path) -> list[dict]:
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{file}: must hold a list of frames, each a mapping; copy or convert it again.")
     return frames
+
+
+def _unpack(content: bytearray) -> object:
+    """What msgpack holds, arrays decoded; refused where it is so many objects that they would not fit into memory."""
+    count = 0
+
+    def counted(values: dict | list) -> dict | list:
+        nonlocal count
+        count += 1 + len(values)
+        if count > MOST_OBJECTS:
+            raise DataError(f"holds more than {MOST_OBJECTS:,} objects, which no file of frames does; copy it again.")
+        return values
+
+    return msgpack.unpackb(
+        content,
+        raw=False,
+        strict_map_key=False,
+        object_hook=lambda values: decode_array(counted(values)),
+        list_hook=counted,
+        max_array_len=MOST_OBJECTS,
+        max_map_len=MOST_OBJECTS,
+    )
 
 
 def _decompressed(stream: BinaryIO) -> zstandard.ZstdDecompressionReader:

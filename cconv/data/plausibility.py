@@ -186,7 +186,10 @@ def _outside(fluid: _Fluid) -> Iterator[_Seen]:
     lower, upper = (torch.tensor(bounds)[open_axes].double() for bounds in (box.lower, box.upper))
     positions = fluid.positions[..., open_axes]
     beyond = torch.maximum(lower - positions, positions - upper)
-    if first := _first((beyond > spacing).any(dim=-1)):
+    margin = (
+        spacing if fluid.scene.has_boundary else max(box.lengths)
+    )  # without walls, a fluid may leave where it began
+    if first := _first((beyond > margin).any(dim=-1)):
         frame, particle, count = first
         distance = float(beyond[frame, particle].max()) / spacing
         yield _Seen(

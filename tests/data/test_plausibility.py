@@ -27,7 +27,7 @@ def lattice(periodic=False, shift=0.0):
         frame_dt=FRAME_DT,
         box=Box((0.0, 0.0), (2.0, 2.0), periodic),
         force=None,
-        has_boundary=False,
+        has_boundary=True,
         velocity_source="stored",
         mass_source="stored",
         missing=(),
@@ -113,6 +113,15 @@ def test_what_makes_no_sense_is_named_with_frame_and_particle(check, damage, fra
     with pytest.raises(AssertionError, match=words):
         raise AssertionError(str(found[check]))
     json.dumps(found[check].as_dict(), allow_nan=False)
+
+
+def test_only_what_is_far_outside_is_named_where_there_are_no_walls():
+    trajectory, scene = lattice()
+    outside(trajectory)
+    without_walls = replace(scene, has_boundary=False)
+    assert "outside" not in [finding.check for finding in trajectory_findings(trajectory, without_walls)]
+    trajectory.positions[3:] += 10.0
+    assert "outside" in [finding.check for finding in trajectory_findings(trajectory, without_walls)]
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.4, 2.5, 10])
