@@ -72,11 +72,12 @@ def test_a_style_is_asked_for_with_a_text(console):
 def test_the_live_table_shows_foreign_strings_as_they_are(console):
     shown, printed = console
     with StudyDisplay(shown) as display:
+        display.on_data([HOSTILE])
         display.on_stage(HOSTILE, 2, 10)
         display.on_trial_start(HOSTILE, {HOSTILE: HOSTILE})
         display.on_trial_end(HOSTILE, "failed", HOSTILE)
         shown.print(display._draw())
-    assert printed().count(SHOWN) >= 6
+    assert printed().count(SHOWN) >= 7
     assert "\x1b[2J" not in printed()
 
 

@@ -111,6 +111,36 @@ class _Rungs(RootModel):
     root: dict[Name, list[_Rung]]
 
 
+class _Line(OpenModel):
+    """Something that does not make sense in the data."""
+
+    line: str
+
+
+class _Seeds(OpenModel):
+    """Seeds in environment.json."""
+
+    data: Whole
+    init: Whole
+    search: Whole
+
+
+class _DataFolder(OpenModel):
+    """Data in environment.json."""
+
+    sha256: str
+
+
+class _Environment(OpenModel):
+    """environment.json, as far as the report needs it."""
+
+    started: str
+    packages: dict[str, str | None]
+    seeds: _Seeds
+    data: _DataFolder
+    data_findings: list[_Line] = []
+
+
 class _Table(RootModel):
     """Any other file."""
 
@@ -154,7 +184,13 @@ class _Summary(OpenModel):
     wall_seconds: _Error
 
 
-_FORMS = {"study.json": _Study, "state.json": _State, "rungs.json": _Rungs, "summary.json": _Summary}
+_FORMS = {
+    "study.json": _Study,
+    "environment.json": _Environment,
+    "state.json": _State,
+    "rungs.json": _Rungs,
+    "summary.json": _Summary,
+}
 
 
 def read_record(path: Path, form: type[BaseModel] = _Table):

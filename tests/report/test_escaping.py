@@ -60,7 +60,10 @@ def page(tmp_path):
     study, environment = run.read("study.json"), run.read("environment.json")
     study["data"]["path"] = HOSTILE
     run.write("study.json", study)
-    run.write("environment.json", environment | {"processor": HOSTILE, "git_commit": HOSTILE, "python": HOSTILE})
+    findings = {"data_findings": [{"line": HOSTILE}]}
+    run.write(
+        "environment.json", environment | {"processor": HOSTILE, "git_commit": HOSTILE, "python": HOSTILE} | findings
+    )
     config = run.path / "trials" / "random_0000" / "config.json"
     known = json.loads(config.read_text())
     config.write_text(json.dumps(known | {"parameters": known["parameters"] | {"window": HOSTILE}}))

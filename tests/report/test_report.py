@@ -162,6 +162,13 @@ def test_a_run_whose_baseline_failed_has_a_report_that_says_so(run):
     assert "seed_1 failed out of memory" in write_report(run).read_text()
 
 
+def test_suspicious_data_are_said_before_everything_else(run):
+    line = "trajectory train/00000, frame 0, particle 5: mass 0 is not positive"
+    run.write("environment.json", run.read("environment.json") | {"data_findings": [{"line": line}]})
+    page = render_report(run)
+    assert 0 < page.index(line) < page.index('id="answer"')
+
+
 def test_an_interrupted_run_has_a_report_too(run):
     (run.path / "summary.json").unlink()
     run.write("state.json", {"state": "interrupted", "stage": "finalists"})

@@ -144,6 +144,7 @@ def test_provenance_is_recorded(run, flow_folder):
     assert environment["data"]["sha256"] == open_dataset(flow_folder).fingerprint()
     assert environment["packages"]["torch"]
     assert set(environment["seeds"]) == {"data", "init", "search"}
+    assert environment["data_findings"] == []
 
 
 def test_optunas_journal_holds_both_searches_and_no_trial_without_an_end(run):

@@ -13,6 +13,12 @@ CONFIG = {
     "init_seed": 0,
 }
 STUDY = {"format": FORMAT, "stages": {"random": {"kind": "random"}}}
+ENVIRONMENT = {
+    "started": "2026-01-01T00:00:00+00:00",
+    "packages": {"torch": "2.13.0"},
+    "seeds": {"data": 0, "init": 0, "search": 0},
+    "data": {"sha256": "0"},
+}
 ENTRY = {"updates": 5, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
 
@@ -192,6 +198,8 @@ def test_a_record_that_does_not_fit_is_named_with_its_key(name, content, message
         ("stages/finalists.json", {"kind": "f", "seconds": 1.0, "finalists": {"../x": {}}}, "a name must match"),
         ("summary.json", {"study": "s"}, "is missing"),
         ("environment.json", [1], "valid dictionary"),
+        ("environment.json", ENVIRONMENT | {"packages": ["torch"]}, "`packages`"),
+        ("environment.json", ENVIRONMENT | {"data_findings": ["suspicious"]}, "`data_findings.0`"),
     ],
 )
 def test_a_file_of_the_run_that_does_not_fit_is_named_with_its_key(name, content, message, tmp_path):
