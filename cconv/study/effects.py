@@ -184,7 +184,7 @@ def _chance_below(
     return scipy.special.ncfdtr(*freedom, odds * scatter, np.asarray(statistic)[..., None]).mean(axis=-1)
 
 
-def _last_where(holds: Callable[[NDArray], NDArray], like: ArrayLike, steps: int = 30) -> NDArray[np.float64]:
+def _last_where(holds: Callable[[NDArray], NDArray], like: ArrayLike, steps: int = 24) -> NDArray[np.float64]:
     """Largest share at which something holds that holds for small shares or for none, by bisection."""
     low, high = np.zeros(np.shape(like)), np.full(np.shape(like), _LARGEST_SHARE)
     for _ in range(steps):

@@ -173,7 +173,7 @@ def coverage_of_a_share(rng, name, residuals, share, shape) -> float:
 @pytest.mark.parametrize("trials", [24, 36, 100])
 @pytest.mark.parametrize("name", HYPERPARAMETERS)
 def test_the_share_of_a_hyperparameter_is_covered(name, trials):
-    rng, times = np.random.default_rng(5), 400
+    rng, times = np.random.default_rng(5), 200
     cases = [(residuals, share) for residuals in RESIDUALS for share in STRENGTHS]
     found = [coverage_of_a_share(rng, name, *case, (times, trials)) for case in cases]
     check(f"share of a {name}", float(np.mean(found)), times * len(cases))
