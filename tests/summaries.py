@@ -38,6 +38,7 @@ def whole_summary(summary: dict) -> dict:
         "asha_share": {"random": {"updates": 4000, "full_updates": 17857, "share": 0.224}},
     }
     whole["importance"] = importances()
+    whole["partial_dependence"] = [dependence("choice", ["poly6", "none"]), dependence("log", [1e-3, 1e-2])]
     whole["ablation"] = {
         "path": [
             {"change": "baseline", "parameters": 9000, "valid_normalized_mse": 0.016, "low": 0.012, "high": 0.02},
@@ -95,6 +96,23 @@ def stability(error: float) -> dict:
 def importances() -> list[dict]:
     """Importances at three rungs, unknown at the first."""
     return [_unknown_importance(15), _importance(45), _importance(135)]
+
+
+def dependence(scale: str, values: list) -> dict:
+    """Partial dependence of a hyperparameter with these values."""
+    error = [0.1 * (position + 1) for position in range(len(values))]
+    return {
+        "parameter": f"of {scale}",
+        "scale": scale,
+        "updates": 1000,
+        "trials": 3,
+        "surrogate_r2": None if scale == "linear" else 0.5,
+        "values": values,
+        "error": error,
+        "low": [each / 2 for each in error],
+        "high": [each * 2 for each in error],
+        "points": [{"value": values[0], "error": 0.2}, {"value": values[-1], "error": 0.7}],
+    }
 
 
 def explanation(dim: int = 2, components: int = 1, particles: int = 60) -> dict[str, np.ndarray]:

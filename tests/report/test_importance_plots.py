@@ -1,6 +1,7 @@
 """Charts of importance show every hyperparameter, its interval, what could have been found, and each raw trial."""
 
 import pytest
+from summaries import dependence
 
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
 
@@ -24,22 +25,6 @@ def entry(updates, censored):
         "surrogate_r2": 0.5,
         "best_share": 0.1,
         "parameters": {"small": judged(0.02, False), "constant": constant, "large": judged(0.6, True)},
-    }
-
-
-def dependence(scale, values):
-    error = [0.1 * (position + 1) for position in range(len(values))]
-    return {
-        "parameter": f"of {scale}",
-        "scale": scale,
-        "updates": 1000,
-        "trials": 3,
-        "surrogate_r2": None if scale == "linear" else 0.5,
-        "values": values,
-        "error": error,
-        "low": [each / 2 for each in error],
-        "high": [each * 2 for each in error],
-        "points": [{"value": values[0], "error": 0.2}, {"value": values[-1], "error": 0.7}],
     }
 
 
