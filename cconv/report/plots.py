@@ -110,12 +110,12 @@ def rung_audit_chart(summary: Mapping) -> Figure:
     """
     table = rung_audit_table(summary)
     figure, panels = new_figure(10, 3.3, columns=len(AUDIT_MEASURES))
+    panels[0].vlines(table["updates"], table["spearman_low"], table["spearman_high"])
     for axes, name in zip(panels, AUDIT_MEASURES, strict=True):
         axes.plot(table["updates"], table[name].astype(float), marker="o")
         axes.set(xscale="log", xlabel="updates at the rung", title=AUDIT_MEASURES[name])
         axes.set_xticks(table["updates"], table["updates"], minor=False)
         axes.minorticks_off()
-    panels[0].vlines(table["updates"], table["spearman_low"], table["spearman_high"])
     return figure
 
 
