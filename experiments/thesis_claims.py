@@ -17,10 +17,13 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from cconv.errors import DataError
+from cconv.report.decidable import decidable
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
+from cconv.study.effects import effects
 from cconv.study.importance import importance_by_rung
 from cconv.study.partial_dependence import partial_dependence
 from cconv.study.records import TrialRecord, write_json
+from cconv.study.rung_audit import spearman_interval
 from cconv.study.space import Choice, FloatRange, IntRange, SearchSpace
 
 SIZE, KERNEL, EXTENT = "num_parameters", "kernel_size", "filter_extent"
@@ -28,7 +31,8 @@ SHAPE = (KERNEL, "hidden_units", "input_channels", "hidden_layers")  # what the 
 NUMBERS = (SIZE, *SHAPE, EXTENT, "learning_rate")
 SAID_WEAK = ("window", "coordinate_mapping", "activation")
 SURE, MATTERS = 0.95, 0.10  # share of resamples that counts as sure; share of the spread from which on a choice matters
-RESAMPLES = 2000  # of correlations
+RESAMPLES = 2000  # of who leads
+SURVIVED, STOPPED = 0.01, 0.1  # in place of errors that are not recorded; only their order counts
 _WHERE = {"survival": "Search 2, survival:", "complete": "Search 3:"}
 
 
@@ -121,7 +125,7 @@ def samples(search_2: pd.DataFrame, search_3: pd.DataFrame) -> list[Sample]:
     search_3 = search_3.assign(**{name: search_3[name].astype(int) for name in SHAPE})
     steps = search_2["step"]
     first = int(steps.min())
-    survived = np.where(steps > first, 0.1, 1.0)  # only the order counts
+    survived = np.where(steps > first, SURVIVED, STOPPED)
     losers = search_2[steps == first]
     full = int(search_3["step"].max())
     return [
@@ -146,12 +150,12 @@ def count_parameters(trial: Mapping) -> int:
 
 
 def correlations(sample: Sample, rng: np.random.Generator) -> dict:
-    """Spearman's rank correlation of each number with the outcome, bootstrap intervals, and who leads how often."""
+    """Spearman's rank correlation of each number with the outcome, its interval, and how often it leads."""
     values = sample.trials[list(NUMBERS)].to_numpy(dtype=np.float64)
     count = len(values)
     draws = [np.arange(count), *rng.integers(count, size=(RESAMPLES, count))]
     found = np.array([_spearman(values[drawn], sample.errors[drawn]) for drawn in draws])
-    low, high = np.percentile(found[1:], (2.5, 97.5), axis=0)
+    intervals = [spearman_interval(float(each), count) for each in found[0]]
     order = np.argsort(-np.abs(found[1:]), axis=1)
     both = np.isin(order[:, :2], [NUMBERS.index(SIZE), NUMBERS.index(KERNEL)]).all(axis=1)
     return {
@@ -159,8 +163,8 @@ def correlations(sample: Sample, rng: np.random.Generator) -> dict:
         "numbers": {
             name: {
                 "correlation": float(found[0, k]),
-                "low": float(low[k]),
-                "high": float(high[k]),
+                "low": intervals[k][0],
+                "high": intervals[k][1],
                 "leads": float(np.mean(order[:, 0] == k)),
             }
             for k, name in enumerate(NUMBERS)
@@ -175,29 +179,19 @@ def _spearman(values: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArr
     return ranks[:, :-1].T @ ranks[:, -1] / np.maximum(scale[:-1] * scale[-1], np.finfo(float).tiny)
 
 
-def influence_of_choice(sample: Sample, name: str, rng: np.random.Generator) -> dict:
-    """Share of the spread of ranks between the values of a choice, its bootstrap interval, p-value, and mean outcome.
-
-    The share is ε² of the Kruskal–Wallis test, (H − k + 1) / (n − k), at least 0; bootstrap intervals reach too high.
-    """
+def influence_of_choice(sample: Sample, name: str) -> dict:
+    """Share of the spread of ranks between the values of a choice, its 95 % interval, p-value, and who survived."""
     words = sample.trials[name].astype(str).to_numpy()
-    count = len(words)
-    shares = [
-        _epsilon_squared(words[drawn], sample.errors[drawn])[0]
-        for drawn in rng.integers(count, size=(RESAMPLES, count))
-    ]
-    share, p_value = _epsilon_squared(words, sample.errors)
-    low, high = np.percentile(shares, (2.5, 97.5))
-    survived = {word: float(np.mean(sample.errors[words == word] < 1)) for word in np.unique(words)}
-    return {"share": share, "low": float(low), "high": float(high), "p_value": p_value, "survived": survived}
-
-
-def _epsilon_squared(words: NDArray, errors: NDArray[np.float64]) -> tuple[float, float]:
-    groups = [errors[words == word] for word in np.unique(words)]
-    if np.ptp(errors) == 0 or len(groups) < 2:
-        return 0.0, 1.0
-    test = scipy.stats.kruskal(*groups)
-    return max(0.0, float((test.statistic - len(groups) + 1) / (len(errors) - len(groups)))), float(test.pvalue)
+    columns = np.equal.outer(words, np.unique(words)).astype(np.float64)
+    found = effects(columns, scipy.stats.rankdata(sample.errors))
+    low, high = found.interval95
+    return {
+        "share": float(found.share),
+        "low": float(low),
+        "high": float(high),
+        "p_value": float(found.p_value),
+        "survived": {word: float(np.mean(sample.errors[words == word] == SURVIVED)) for word in np.unique(words)},
+    }
 
 
 def as_records(sample: Sample, space: SearchSpace) -> list[TrialRecord]:
@@ -225,11 +219,10 @@ def with_size(sample: Sample) -> SearchSpace:
     return SearchSpace(name=sample.space.name, description=sample.space.description, parameters={SIZE: size} | kept)
 
 
-def importance(sample: Sample, space: SearchSpace, resamples: int) -> dict:
-    """f-ANOVA and PED-ANOVA of the sample."""
-    return importance_by_rung(
-        as_records(sample, space), space, [sample.updates], resamples=resamples, useless_error=1.0
-    )[0]
+def importance(sample: Sample, space: SearchSpace) -> dict:
+    """Importances of the sample, by all methods."""
+    (entry,) = importance_by_rung(as_records(sample, space), space, [sample.updates], useless_error=1.0)
+    return entry
 
 
 def departure_from_uniform(search_3: pd.DataFrame) -> dict[str, float]:
@@ -240,7 +233,7 @@ def departure_from_uniform(search_3: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def analyse(search_2: pd.DataFrame, search_3: pd.DataFrame, resamples: int) -> dict:
+def analyse(search_2: pd.DataFrame, search_3: pd.DataFrame) -> dict:
     """Every figure that the answers rest on, by sample."""
     rng = np.random.default_rng(0)
     figures = {}
@@ -251,10 +244,10 @@ def analyse(search_2: pd.DataFrame, search_3: pd.DataFrame, resamples: int) -> d
             "correlations": correlations(sample, rng),
         }
         if sample.updates is not None:
-            figures[sample.name]["importance"] = importance(sample, sample.space, resamples)
-            figures[sample.name]["importance_with_size"] = importance(sample, with_size(sample), resamples)
+            figures[sample.name]["importance"] = importance(sample, sample.space)
+            figures[sample.name]["importance_with_size"] = importance(sample, with_size(sample))
     survival = samples(search_2, search_3)[0]
-    figures["survival"]["choices"] = {name: influence_of_choice(survival, name, rng) for name in SAID_WEAK}
+    figures["survival"]["choices"] = {name: influence_of_choice(survival, name) for name in SAID_WEAK}
     drawn = pd.concat([search_2, search_3])
     counted = [count_parameters(trial) for trial in drawn.to_dict("records")]
     return figures | {
@@ -312,34 +305,31 @@ def _strongest(fair: Mapping) -> dict:
 
 def _extent(fair: Mapping, figures: Mapping) -> dict:
     leads = {name: found["numbers"][EXTENT]["leads"] for name, found in fair.items()}
-    above = {name: figures[name]["importance"]["f_anova"]["parameters"][EXTENT]["above_noise"] for name in fair}
+    judged = {name: figures[name]["importance"]["parameters"][EXTENT] for name in fair}
     smallest, largest = figures["best_of_search_3"]
+    weak = all(each["high"] <= MATTERS for each in judged.values())
     return {
         "claim": "The filter extent is not among what matters most (the thesis does not name it).",
-        "verdict": "does not hold"
-        if max(leads.values()) >= SURE
-        else "cannot be decided"
-        if any(above.values())
-        else "holds",
+        "verdict": "does not hold" if max(leads.values()) >= SURE else "holds" if weak else "cannot be decided",
         "why": " ".join(
-            f"{_WHERE[name]} {_quoted(found, (EXTENT,))}, {_noise(above[name])}." for name, found in fair.items()
+            f"{_WHERE[name]} {_quoted(found, (EXTENT,))}, share of the variance {_share(judged[name])}."
+            for name, found in fair.items()
         )
         + f" The ten best of search 3 have extents from {smallest:.3f} to {largest:.3f}, of a range up to 0.25.",
     }
 
 
 def _weak(name: str, survival: Mapping) -> dict:
-    choice, judged = survival["choices"][name], survival["importance"]["f_anova"]["parameters"][name]
+    choice = survival["choices"][name]
     matters = choice["p_value"] < (1 - SURE) / len(SAID_WEAK)
-    weak = choice["high"] <= MATTERS and not judged["above_noise"]
+    weak = choice["high"] <= MATTERS
     rates = ", ".join(
         f"{word} {rate:.0%}" for word, rate in sorted(choice["survived"].items(), key=lambda item: -item[1])
     )
     return {
         "claim": f"The {_called(name)} has little influence.",
         "verdict": "does not hold" if matters else "holds" if weak else "cannot be decided",
-        "why": f"Share of the spread {choice['share']:.2f} ({choice['low']:.2f} to {choice['high']:.2f}), "
-        f"p = {choice['p_value']:.2g}; f-ANOVA {judged['importance']:.2f}, {_noise(judged['above_noise'])}. "
+        "why": f"Share of the spread {_share(choice)}, p = {choice['p_value']:.2g}. "
         f"Survived the first decision: {rates}.",
     }
 
@@ -366,8 +356,8 @@ def _called(name: str) -> str:
     return {SIZE: "number of parameters"}.get(name, name.replace("_", " "))
 
 
-def _noise(above: bool) -> str:
-    return "above noise" if above else "not above noise"
+def _share(found: Mapping) -> str:
+    return f"{found['share']:.2f} ({found['low']:.2f} to {found['high']:.2f})"
 
 
 def page(figures: Mapping, verdicts: Sequence[Mapping]) -> str:
@@ -401,16 +391,17 @@ def _cells(figures: Mapping, name: str) -> Iterator[str]:
 
 def _importance_line(figures: Mapping) -> str:
     entry = figures["importance"]
-    above = {}
-    for method in ("f_anova", "ped_anova"):
-        judged = entry[method]["parameters"]
-        order = sorted((name for name in judged if judged[name]["above_noise"]), key=lambda n: -judged[n]["importance"])
-        above[method] = ", ".join(f"{_called(name)} {judged[name]['importance']:.2f}" for name in order) or "nothing"
-    return (
-        f"- {figures['title']}: R² on unseen trials {entry['surrogate_r2']:.2f}; above noise by f-ANOVA: "
-        f"{above['f_anova']} (floor {entry['f_anova']['noise_floor']:.2f}); by PED-ANOVA: {above['ped_anova']} "
-        f"(floor {entry['ped_anova']['noise_floor']:.2f})."
+    (sentence,) = decidable({"importance": [entry]})
+    strongest = "; ".join(
+        f"{called} {', '.join(_strongest_by(entry, method))}"
+        for called, method in (("by f-ANOVA", "f_anova"), ("by PED-ANOVA", "ped_anova"))
     )
+    return f"- {figures['title']}. {sentence} Without intervals, the strongest {strongest}."
+
+
+def _strongest_by(entry: Mapping, method: str) -> list[str]:
+    values = {name: each[method] for name, each in entry["parameters"].items()}
+    return [f"{_called(name)} {values[name]:.2f}" for name in sorted(values, key=values.__getitem__)[:-4:-1]]
 
 
 _COLUMNS = ("survival", "stopped", "complete", "mixed")
@@ -422,10 +413,11 @@ Written by `experiments/thesis_claims.py`; every figure is in `claims.json`.
 |---|---|---|
 {table}
 
-Figures in brackets are 95 % bootstrap intervals over trials. A claim about order holds, or does not, if it is so in
-{sure} of the resamples. A choice has little influence if it makes up no more than {matters} of the spread of ranks at
-the upper end of its interval (ε² of the Kruskal-Wallis test) and f-ANOVA does not find it above noise; it has influence
-if p is below 0.05 / 3, as three are tested. Between the two nothing is decided: absence of evidence is not weakness.
+Figures in brackets are 95 % intervals: of a rank correlation by Bonett and Wright, of a share by the noncentral F
+distribution. A claim about order holds, or does not, if it is so in {sure} of the resamples of trials. A choice has
+little influence if it makes up no more than {matters} of the spread of ranks at the upper end of its interval; it has
+influence if p is below 0.05 / 3, as three are tested. Between the two nothing is decided: absence of evidence is not
+weakness.
 
 ## Which trials may be compared
 
@@ -468,8 +460,8 @@ def draw(search_2: pd.DataFrame, search_3: pd.DataFrame, figures: Mapping, out: 
         chart = importance_chart([figures[name]["importance"]], title=figures[name]["title"])
         chart.savefig(out / f"importance_{search}.png", dpi=90)
     sample = next(sample for sample in samples(search_2, search_3) if sample.name == "complete")
-    records, judged = as_records(sample, sample.space), figures["complete"]["importance"]["f_anova"]["parameters"]
-    order = sorted(judged, key=lambda name: -judged[name]["importance"])
+    records, judged = as_records(sample, sample.space), figures["complete"]["importance"]["parameters"]
+    order = sorted(judged, key=lambda name: -judged[name]["share"])
     dependences = [partial_dependence(records, sample.space, sample.updates, name, useless_error=1.0) for name in order]
     partial_dependence_chart(dependences).savefig(out / "partial_dependence_search_3.png", dpi=90)
 
@@ -478,11 +470,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder with the thesis's trials")
     parser.add_argument("--out", type=Path, default=Path("runs/thesis_trials"), help="folder to write")
-    parser.add_argument("--resamples", type=int, default=50, help="resamples of each importance")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     search_2, search_3 = read_trials(arguments.data)
-    figures = analyse(search_2, search_3, arguments.resamples)
+    figures = analyse(search_2, search_3)
     verdicts = list(answers(figures))
     write_json(arguments.out / "claims.json", {"answers": verdicts, "figures": figures})
     (arguments.out / "claims.md").write_text(page(figures, verdicts))

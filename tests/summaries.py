@@ -25,8 +25,11 @@ def whole_summary(summary: dict) -> dict:
         "models": {name: [_size(1000), _size(100_000)] for name in ids},
         "exponents": dict.fromkeys(ids, 1.03),
     }
-    unmeasured = {"updates": 15, "trials": 2, "spearman": None, "recall": None, "regret": None, "verdict": "undecided"}
-    whole["rung_audit"] = [unmeasured, _rung(45, 0.6, "loses good trials"), _rung(135, 0.9, "keeps the best")]
+    whole["rung_audit"] = [
+        _rung(15, None, "undecided"),
+        _rung(45, 0.6, "loses good trials"),
+        _rung(135, 0.9, "keeps the best"),
+    ]
     whole["references"] = {
         "strategies": {
             "ASHA": {"updates": 4000, "best_valid": 9e-4, "curve": [[400, 0.01], [4000, 9e-4]]},
@@ -34,7 +37,8 @@ def whole_summary(summary: dict) -> dict:
         },
         "asha_share": {"random": {"updates": 4000, "full_updates": 17857, "share": 0.224}},
     }
-    whole["importance"] = [_importance(45), _importance(135)]
+    whole["importance"] = importances()
+    whole["partial_dependence"] = [dependence("choice", ["poly6", "none"]), dependence("log", [1e-3, 1e-2])]
     whole["ablation"] = {
         "path": [
             {"change": "baseline", "parameters": 9000, "valid_normalized_mse": 0.016, "low": 0.012, "high": 0.02},
@@ -86,6 +90,28 @@ def stability(error: float) -> dict:
         "failures": failures,
         "thresholds": {"stressed_error": 0.05, "regime_error": 0.5, "still": 0.01, "precision": 1e-3, "density": 0.02},
         "counts": {"seeds": 3, "plain_frames": 20, "stressed_frames": 3},
+    }
+
+
+def importances() -> list[dict]:
+    """Importances at three rungs, unknown at the first."""
+    return [_unknown_importance(15), _importance(45), _importance(135)]
+
+
+def dependence(scale: str, values: list) -> dict:
+    """Partial dependence of a hyperparameter with these values."""
+    error = [0.1 * (position + 1) for position in range(len(values))]
+    return {
+        "parameter": f"of {scale}",
+        "scale": scale,
+        "updates": 1000,
+        "trials": 3,
+        "surrogate_r2": None if scale == "linear" else 0.5,
+        "values": values,
+        "error": error,
+        "low": [each / 2 for each in error],
+        "high": [each * 2 for each in error],
+        "points": [{"value": values[0], "error": 0.2}, {"value": values[-1], "error": 0.7}],
     }
 
 
@@ -146,17 +172,28 @@ def _size(num_particles: int) -> dict:
     return {"num_particles": num_particles, "ms_per_frame": ms, "ms_low": 0.9 * ms, "ms_high": 1.1 * ms} | parts
 
 
-def _rung(updates: int, value: float, verdict: str) -> dict:
-    measures = ("spearman", "recall", "regret")
-    interval = {"value": value, "low": value - 0.1, "high": value + 0.1}
-    return {"updates": updates, "trials": 16, "verdict": verdict} | dict.fromkeys(measures, interval)
+def _rung(updates: int, value: float | None, verdict: str) -> dict:
+    interval = None if value is None else [value - 0.1, value + 0.1]
+    reason = "2 trials, and at least 12 are needed" if value is None else ""
+    measures = dict.fromkeys(("spearman", "recall", "regret"), value)
+    facts = {"updates": updates, "trials": 16, "verdict": verdict}
+    return facts | measures | {"spearman_ci95": interval, "why_no_interval": reason}
 
 
 def _importance(updates: int) -> dict:
-    judged = {"importance": 0.4, "low": 0.3, "high": 0.5, "above_noise": True}
-    found = {"noise_floor": 0.1, "parameters": {"layers": judged, "window": judged | {"above_noise": False}}}
-    facts = {"updates": updates, "trials": 16, "censored": True, "clipped": 0, "surrogate_r2": 0.7}
-    return facts | {"f_anova": found, "ped_anova": found}
+    found = {"share": 0.4, "low": 0.3, "high": 0.5, "p_value": 0.01, "decided": True, "f_anova": 0.35, "ped_anova": 0.2}
+    weak = found | {"share": 0.1, "low": 0.0, "p_value": 0.6, "decided": False}
+    constant = weak | dict.fromkeys(("share", "low", "high", "p_value"))
+    facts = {"updates": updates, "trials": 16, "censored": True, "clipped": 0, "why_none": ""}
+    measured = {"detectable_share": 0.62, "surrogate_r2": 0.7, "best_share": 0.3}
+    return facts | measured | {"parameters": {"layers": found, "window": weak, "message": constant}}
+
+
+def _unknown_importance(updates: int) -> dict:
+    facts = {"updates": updates, "trials": 16, "censored": False, "clipped": 15}
+    reason = "15 of 16 trials are no better than predicting the mean"
+    unknown = dict.fromkeys(("detectable_share", "surrogate_r2", "best_share"))
+    return facts | unknown | {"why_none": reason, "parameters": {}}
 
 
 def _comparison(name: str, number: int) -> dict:

@@ -58,7 +58,7 @@ def written(folder, claims, error_of):
 
 
 def verdicts(claims, folder):
-    figures = claims.analyse(*claims.read_trials(folder), resamples=2)
+    figures = claims.analyse(*claims.read_trials(folder))
     found = list(claims.answers(figures))
     text = claims.page(figures, found)
     assert all(f"| {each['claim']} | **{each['verdict']}** |" in text for each in found)

@@ -7,36 +7,40 @@ import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-_ABOVE, _BELOW, _FLOOR, _POINTS = "#4c72b0", "0.75", "#c44e52", "0.45"
-_METHODS = {"f_anova": "share of variance (f-ANOVA)", "ped_anova": "share of what sets the best apart (PED-ANOVA)"}
+_FOUND, _OPEN, _LIMIT, _POINTS = "#4c72b0", "0.75", "#c44e52", "0.45"
+_TREES = "middle 80 % of its trees"
+_METHODS = {"f_anova": ("f-ANOVA: share of the variance", "o"), "ped_anova": ("PED-ANOVA: share of the sum", "D")}
 
 
 def importance_chart(entries: Sequence[Mapping], title: str = "importance of hyperparameters") -> Figure:
-    """Bars of importance with intervals and the floor of noise: a row a rung, a column a method.
+    """Shares of the variance with intervals, found or not, and beside them two estimates without: a row a rung.
 
     Args:
-        entries: Of `cconv.study.importance.importance_by_rung`.
+        entries: Of `cconv.study.importance.importance_by_rung`, one or more with importances; the others are left out.
         title: Title of the figure.
     """
-    names = _by_importance(entries)
+    entries = [entry for entry in entries if entry["parameters"]]
+    names = _by_share(entries[0])
     with sns.axes_style("whitegrid"):
-        figure = Figure(figsize=(11, max(2.2, 0.8 + 0.24 * len(names)) * len(entries) + 0.4), layout="constrained")
-        panels = figure.subplots(len(entries), 2, squeeze=False, sharey=True, sharex="col")
-    for row, entry in zip(panels, entries, strict=True):
-        for axes, method in zip(row, _METHODS, strict=True):
-            _bars(axes, entry[method], names)
-            axes.set_title(_METHODS[method] if method == "ped_anova" else f"{_METHODS[method]}\n{_quality(entry)}")
-        row[0].set_ylabel(_sample(entry))
+        figure = Figure(figsize=(11, max(2.6, 1.2 + 0.24 * len(names)) * len(entries) + 0.8), layout="constrained")
+        panels = figure.subplots(len(entries), 2, squeeze=False, sharey=True, sharex=True)
+    for (tested, estimated), entry in zip(panels, entries, strict=True):
+        _shares(tested, entry, names)
+        _estimates(estimated, entry, names)
+        tested.set_ylabel(_sample(entry))
     panels[0, 0].invert_yaxis()
-    for axes in panels[0]:
-        axes.set_xlim(left=0)
-    panels[0, 1].legend(loc="lower right", fontsize=8)
+    panels[0, 0].set_xlim(0, 1)
+    for column in (0, 1):
+        handles, labels = panels[0, column].get_legend_handles_labels()
+        panels[-1, column].legend(handles, labels, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     figure.suptitle(title)
     return figure
 
 
 def partial_dependence_chart(dependences: Sequence[Mapping], columns: int = 3) -> Figure:
     """Error against each hyperparameter: the surrogate's mean with the middle 80 % of its trees, and the raw trials.
+
+    How far the trees differ is no confidence interval, and the legend says what is drawn.
 
     Args:
         dependences: Of `cconv.study.partial_dependence.partial_dependence`, most important first.
@@ -60,20 +64,31 @@ def partial_dependence_chart(dependences: Sequence[Mapping], columns: int = 3) -
     return figure
 
 
-def _by_importance(entries: Sequence[Mapping]) -> list[str]:
-    judged = entries[0]["f_anova"]["parameters"]
-    return sorted(judged, key=lambda name: -judged[name]["importance"])
+def _by_share(entry: Mapping) -> list[str]:
+    judged = entry["parameters"]
+    return sorted(judged, key=lambda name: -(judged[name]["share"] or 0.0))
 
 
-def _bars(axes: Axes, found: Mapping, names: Sequence[str]) -> None:
-    judged = [found["parameters"][name] for name in names]
-    colors = [_ABOVE if each["above_noise"] else _BELOW for each in judged]
-    axes.barh(range(len(names)), [each["importance"] for each in judged], color=colors, height=0.65)
-    lows, highs = ([each[end] for each in judged] for end in ("low", "high"))
-    axes.hlines(range(len(names)), lows, highs, color="0.15", lw=1.2, label="95 % over resampled trials")
-    axes.axvline(found["noise_floor"], color=_FLOOR, ls="--", lw=1.2, label="floor of noise (dummy)")
+def _shares(axes: Axes, entry: Mapping, names: Sequence[str]) -> None:
+    tested = [(row, entry["parameters"][name]) for row, name in enumerate(names)]
+    tested = [(row, each) for row, each in tested if each["share"] is not None]
+    for decided, color, label in ((True, _FOUND, "found"), (False, _OPEN, "not found, which is not absent")):
+        rows = [row for row, each in tested if each["decided"] is decided]
+        axes.barh(rows, [each["share"] for row, each in tested if row in rows], color=color, height=0.65, label=label)
+    rows, lows, highs = zip(*((row, each["low"], each["high"]) for row, each in tested), strict=True)
+    axes.hlines(rows, lows, highs, color="0.15", lw=1.2, label="95 % interval of the share")
+    label = "found four times in five from here on"
+    axes.axvline(entry["detectable_share"], color=_LIMIT, ls="--", lw=1.2, label=label)
     axes.set_yticks(range(len(names)), names)
     axes.grid(axis="y", visible=False)
+    axes.set_title("share of the variance that it decides alone", fontsize=11)
+
+
+def _estimates(axes: Axes, entry: Mapping, names: Sequence[str]) -> None:
+    for method, (label, marker) in _METHODS.items():
+        values = [entry["parameters"][name][method] for name in names]
+        axes.plot(values, range(len(names)), marker, ms=5, label=label, alpha=0.8)
+    axes.set_title(f"estimates without intervals\n{_quality(entry)}", fontsize=11)
 
 
 def _quality(found: Mapping) -> str:
@@ -94,11 +109,11 @@ def _dependence(axes: Axes, dependence: Mapping) -> None:
     axes.plot(x, [point["error"] for point in dependence["points"]], ".", color=_POINTS, alpha=0.6, ms=5, label="trial")
     axes.set(yscale="log", title=dependence["parameter"], xscale="log" if dependence["scale"] == "log" else "linear")
     if not choice:
-        axes.fill_between(positions, dependence["low"], dependence["high"], color=_ABOVE, alpha=0.2, lw=0)
-        axes.plot(positions, dependence["error"], color=_ABOVE, label="surrogate", zorder=3)
+        axes.fill_between(positions, dependence["low"], dependence["high"], color=_FOUND, alpha=0.2, lw=0, label=_TREES)
+        axes.plot(positions, dependence["error"], color=_FOUND, label="surrogate", zorder=3)
         return
-    axes.vlines(positions, dependence["low"], dependence["high"], color=_ABOVE, lw=1.5)
-    axes.plot(positions, dependence["error"], "o", color=_ABOVE, label="surrogate", zorder=3)
+    axes.vlines(positions, dependence["low"], dependence["high"], color=_FOUND, lw=1.5, label=_TREES)
+    axes.plot(positions, dependence["error"], "o", color=_FOUND, label="surrogate", zorder=3)
     labels = [str(value) for value in values]
     axes.set_xticks(positions, [label.replace("_to_", "_to_\n", 1) for label in labels])
     axes.tick_params(axis="x", labelsize=8)

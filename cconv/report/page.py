@@ -10,6 +10,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
+from cconv.report.decidable import decidable
 from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
 from cconv.report.interactive import interactive_html
@@ -22,7 +23,7 @@ from cconv.report.plots import (
     rung_audit_chart,
     strategies_chart,
 )
-from cconv.report.tables import MEAN_PREDICTOR, curves_table, finalists_table, trials_table
+from cconv.report.tables import MEAN_PREDICTOR, curves_table, finalists_table, importance_table, trials_table
 from cconv.report.verdicts import verdict_matrix
 from cconv.study.records import RunFolder
 
@@ -31,7 +32,6 @@ _CHARTS: dict[str, Callable[[Mapping], Figure]] = {
     "growth": growth_chart,
     "references": strategies_chart,
     "rung_audit": rung_audit_chart,
-    "importance": lambda summary: importance_chart(summary["importance"]),
     "partial_dependence": lambda summary: partial_dependence_chart(summary["partial_dependence"]),
 }
 
@@ -94,11 +94,20 @@ def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
         "chart": interactive_html(summary),
         "charts": {name: _picture(draw(summary)) for name, draw in _CHARTS.items() if summary.get(name)}
         | {"budget": _picture(budget_chart(curves_table(run), [entry["id"] for entry in summary["finalists"]]))}
+        | _importance_chart(summary)
         | ({"ablation": _picture(ablation_chart(summary))} if summary.get("ablation", {}).get("path") else {}),
+        "decidable": decidable(summary),
+        "importances": importance_table(summary).to_dict("records"),
         "finalists": _finalists_rows(summary),
         "stability": verdict_matrix(summary),
         "explained": _explained(run, summary),
     }
+
+
+def _importance_chart(summary: Mapping) -> dict[str, str]:
+    """The chart of importances, if there are any: at some rungs too little is known for bars."""
+    known = [entry for entry in summary.get("importance", []) if entry["parameters"]]
+    return {"importance": _picture(importance_chart(known))} if known else {}
 
 
 def _lead(text: str) -> tuple[str, str]:

@@ -104,16 +104,15 @@ def strategies_chart(summary: Mapping) -> Figure:
 
 
 def rung_audit_chart(summary: Mapping) -> Figure:
-    """What the order of the trials at each rung says of the order at the full budget, with 95 % intervals.
+    """What the order of the trials at each rung says of the order at the full budget.
 
-    A rung that too few trials reached to be measured has no point.
+    The rank correlation has its 95 % interval, from twelve trials on. A rung that too few trials reached has no point.
     """
     table = rung_audit_table(summary)
     figure, panels = new_figure(10, 3.3, columns=len(AUDIT_MEASURES))
+    panels[0].vlines(table["updates"], table["spearman_low"], table["spearman_high"])
     for axes, name in zip(panels, AUDIT_MEASURES, strict=True):
-        value, low, high = (table[column].astype(float) for column in (name, f"{name}_low", f"{name}_high"))
-        bars = [(value - low).clip(lower=0), (high - value).clip(lower=0)]
-        axes.errorbar(table["updates"], value, yerr=bars, marker="o", capsize=3)
+        axes.plot(table["updates"], table[name].astype(float), marker="o")
         axes.set(xscale="log", xlabel="updates at the rung", title=AUDIT_MEASURES[name])
         axes.set_xticks(table["updates"], table["updates"], minor=False)
         axes.minorticks_off()

@@ -121,18 +121,38 @@ def strategies_table(summary: Mapping) -> pd.DataFrame:
 
 
 def rung_audit_table(summary: Mapping) -> pd.DataFrame:
-    """One row a rung: updates, then value, low and high end of each measure of the audit, and the verdict.
+    """One row a rung: updates, trials, the measures of the audit, the correlation's interval or why none, the verdict.
 
     Measures of a rung that too few trials reached are empty.
     """
-    unknown = {"value": None, "low": None, "high": None}
     rows = []
     for rung in summary.get("rung_audit", []):
-        row = {"updates": rung["updates"]}
-        for name in AUDIT_MEASURES:
-            measure = rung.get(name) or unknown
-            row |= {name: measure["value"], f"{name}_low": measure["low"], f"{name}_high": measure["high"]}
-        rows.append(row | {"verdict": rung.get("verdict", "")})
+        low, high = rung["spearman_ci95"] or (math.nan, math.nan)
+        rows.append(
+            {
+                "updates": rung["updates"],
+                "trials": rung["trials"],
+                **{name: rung[name] for name in AUDIT_MEASURES},
+                "spearman_low": low,
+                "spearman_high": high,
+                "why_no_interval": rung["why_no_interval"],
+                "verdict": rung["verdict"],
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def importance_table(summary: Mapping) -> pd.DataFrame:
+    """One row a rung and hyperparameter, the largest share first; rungs without importances are left out.
+
+    Columns: updates; hyperparameter; share of the variance with its 95 % interval from low to high; p_value, adjusted
+    for the number of hyperparameters; decided; f_anova and ped_anova, which have no interval.
+    """
+    rows = [
+        {"updates": entry["updates"], "hyperparameter": name, **each}
+        for entry in summary.get("importance", [])
+        for name, each in sorted(entry["parameters"].items(), key=lambda item: -(item[1]["share"] or 0.0))
+    ]
     return pd.DataFrame(rows)
 
 

@@ -1,14 +1,15 @@
-"""Which hyperparameters decide the error, at each rung apart, with intervals and a floor below which all is noise.
+"""Which hyperparameters decide the error, at each rung apart, and how strong one must be for so many trials to find it.
 
-Two questions, two methods. f-ANOVA (Hutter et al., "An Efficient Approach for Assessing Hyperparameter Importance",
-ICML 2014): which share of the variance of log10 error over the whole space is due to a hyperparameter alone?
-PED-ANOVA (Watanabe et al., "PED-ANOVA: Efficiently Quantifying Hyperparameter Importance in Arbitrary Subspaces", IJCAI
-2023): by which hyperparameters do the best trials differ from all? Both belong on trials that were drawn at random.
+The answer is a test: which share of the variance of log10 error does a hyperparameter decide alone, and is that more
+than chance (`cconv.study.effects`)? Beside it stand two methods without intervals, as none that was tried holds the
+true value often enough with few trials. f-ANOVA (Hutter et al., "An Efficient Approach for Assessing Hyperparameter
+Importance", ICML 2014) estimates the same share by a random forest. PED-ANOVA (Watanabe et al., "PED-ANOVA: Efficiently
+Quantifying Hyperparameter Importance in Arbitrary Subspaces", IJCAI 2023) asks by which hyperparameters the best trials
+differ from all. All of them belong on trials that were drawn at random.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,18 +19,16 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.importance import FanovaImportanceEvaluator, PedAnovaImportanceEvaluator
 from optuna.trial import create_trial
 
+from cconv.study.effects import FAMILY_LEVEL, adjusted_p_values, detectable_share, effects
 from cconv.study.records import TrialRecord
 from cconv.study.surrogate import FEWEST_TRIALS, Axis, axes_of, coordinates, cross_validated_r2, trials_at
 
 if TYPE_CHECKING:  # spaces need torch, which readers of records need not load
     from cconv.study.space import SearchSpace
 
-Method = Callable[[Sequence[Axis], NDArray[np.float64], NDArray[np.float64], int], NDArray[np.float64]]
-
-LEVELS = (2.5, 97.5)  # percent
 _TREES = 12
+_NONE = {"detectable_share": None, "surrogate_r2": None, "best_share": None, "parameters": {}}
 _BEST_SHARE, _FEWEST_BEST = 0.1, 5  # PED-ANOVA's best trials: a tenth, but no fewer than Optuna advises
-_DUMMY = Axis("(dummy)", (0.0, 1.0))
 
 
 def importance_by_rung(
@@ -39,113 +38,121 @@ def importance_by_rung(
     *,
     useless_error: float,
     seed: int = 0,
-    resamples: int = 50,
 ) -> list[dict]:
     """Importance of every hyperparameter at each rung, from the trials that have an error at exactly that rung.
-
-    Intervals are percentiles over resampled trials; a resample has fewer distinct trials, so that an interval may lie
-    below the importance itself. Each resample has a hyperparameter more, a dummy: a random permutation of evenly spaced
-    numbers. The floor of noise is the upper end of the dummy's interval, and what exceeds it is above noise; for
-    f-ANOVA only if the surrogate predicts trials that it has not seen. Of what is below nothing is known: weak is shown
-    by the upper end of an interval. To ask that the lower end exceed the floor is too strict: in 8 simulations of 40
-    trials and 15 hyperparameters it missed seven times a choice that made up a third of the variance. This rule
-    missed it once, and took about one of a hundred hyperparameters without influence for one with.
 
     Args:
         records: Trials of one stage that drew at random.
         space: The space that they were drawn from.
         rungs: Numbers of updates, ascending.
-        useless_error: Error of predicting the mean, up to which errors count.
-        seed: Of resamples, dummies and forests.
-        resamples: Number of resamples.
+        useless_error: Error up to which errors count: that of predicting the mean, or the one at which trials are given
+            up, if that is smaller.
+        seed: Of permutations and forests.
 
     Returns:
-        One entry a rung with at least ten trials and errors that differ: "updates", "trials"; "censored", whether some
-        trials were stopped before, so that what is left is a selection by error; "clipped", how many count with the
-        useless error; "surrogate_r2", cross-validated; and for "f_anova" and "ped_anova" their settings, "noise_floor"
-        and "parameters", which gives "importance", "low", "high", "above_noise" for each. f-ANOVA's are shares of the
-        variance, whose rest is interactions; PED-ANOVA's are shares of the sum over all hyperparameters.
+        One entry a rung: "updates", "trials"; "clipped", how many count with the useless error; "censored", whether
+        trials were stopped before that do not count, so that what is left is a selection; "why_none", the reason why
+        no importance is given, or "". Then "parameters" is empty, else it gives for each hyperparameter "share" of the
+        variance with its 95 % interval from "low" to "high" (None if the trials do not vary it); "p_value", adjusted
+        for the number of hyperparameters, and "decided", whether it is below 5 %; "f_anova", a share of the variance;
+        "ped_anova", a share of the sum over all. "detectable_share" is the smallest share that is found four times in
+        five whichever hyperparameter has it, "surrogate_r2" is that of f-ANOVA's kind of forest on unseen trials,
+        "best_share" says which trials are PED-ANOVA's best; all None without importances.
     """
     axes = axes_of(space)
     entries = []
     for previous, updates in zip([0, *rungs], rungs, strict=False):
         trials, targets = trials_at(records, updates, after=previous, useless_error=useless_error)
-        if len(trials) >= FEWEST_TRIALS and np.ptp(targets) > 0:
-            points = coordinates(axes, [trial.parameters for trial in trials])
-            entry = _entry(axes, points, targets, np.random.default_rng([seed, updates]), resamples)
-            clipped = int(np.sum(targets == np.log10(useless_error)))
-            facts = {"updates": updates, "censored": _stopped_by(records, previous), "clipped": clipped}
-            entries.append(facts | entry)
+        points = coordinates(axes, [trial.parameters for trial in trials])
+        clipped = int(np.sum(targets == np.log10(useless_error)))
+        facts = {
+            "updates": updates,
+            "trials": len(trials),
+            "clipped": clipped,
+            "censored": _lacks_stopped(records, trials, updates),
+            "why_none": _why_none(axes, points, targets, clipped),
+        }
+        rng = np.random.default_rng([seed, updates])
+        entries.append(
+            facts | (_NONE if facts["why_none"] else _measure(axes, points, targets, int(rng.integers(2**31))))
+        )
     return entries
 
 
-def _stopped_by(records: Sequence[TrialRecord], updates: int) -> bool:
-    return any(record.outcome == "stopped" and record.log[-1]["updates"] <= updates for record in records)
+def _lacks_stopped(records: Sequence[TrialRecord], counted: Sequence[TrialRecord], updates: int) -> bool:
+    known = {record.id for record in counted}
+    stopped = (record for record in records if record.outcome == "stopped" and record.id not in known)
+    return any(record.log and record.log[-1]["updates"] < updates for record in stopped)
 
 
-def _entry(
-    axes: Sequence[Axis],
-    points: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    rng: np.random.Generator,
-    resamples: int,
-) -> dict:
-    r2 = cross_validated_r2(axes, points, targets, seed=int(rng.integers(2**31)))
+def _why_none(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], clipped: int) -> str:
+    """Too few trials, too few below the useless error, or no difference: the reason in words, or ""."""
+    trials = len(targets)
+    if trials < FEWEST_TRIALS:
+        return f"{trials} trials were measured, and at least {FEWEST_TRIALS} are needed"
+    if trials - clipped < max(FEWEST_TRIALS, trials / 2):
+        return (
+            f"{clipped} of {trials} trials are no better than predicting the mean or were given up, and at least half "
+            f"and no fewer than {FEWEST_TRIALS} must be better"
+        )
+    if np.ptp(targets) == 0:
+        return "all errors are equal"
+    varies = any(_is_testable(axis, column) for axis, column in zip(axes, points.T, strict=True))
+    return "" if varies else "no hyperparameter varies among the trials"
+
+
+def _is_testable(axis: Axis, coordinates: NDArray[np.float64]) -> bool:
+    values = len(np.unique(coordinates))
+    return values > 1 and (axis.levels is None or values < len(coordinates))
+
+
+def _measure(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int) -> dict:
     best = max(_BEST_SHARE, min(_FEWEST_BEST / len(targets), 0.5))
-    f_anova = _assess(_f_anova, axes, points, targets, rng, resamples)
-    ped_anova = _assess(partial(_ped_anova, best_share=best), axes, points, targets, rng, resamples)
-    if r2 <= 0:
-        for judged in f_anova["parameters"].values():
-            judged["above_noise"] = False
+    tested, detectable = _tests(axes, points, targets, seed)
+    f_anova = _f_anova(axes, points, targets, seed)
+    ped_anova = _ped_anova(axes, points, targets, best)
     return {
-        "trials": len(targets),
-        "surrogate_r2": r2,
-        "f_anova": {"trees": _TREES} | f_anova,
-        "ped_anova": {"target_quantile": best, "region_quantile": 1.0, "evaluate_on_local": True} | ped_anova,
-    }
-
-
-def _assess(
-    method: Method,
-    axes: Sequence[Axis],
-    points: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    rng: np.random.Generator,
-    resamples: int,
-) -> dict:
-    """Importances from all trials, and their percentiles over resampled trials, each time with another dummy."""
-    resampled = []
-    for _ in range(resamples):
-        drawn = rng.integers(len(targets), size=len(targets))
-        with_dummy = np.column_stack([points, _dummy(len(targets), rng)])
-        resampled.append(method([*axes, _DUMMY], with_dummy[drawn], targets[drawn], int(rng.integers(2**31))))
-    low, high = np.percentile(resampled, LEVELS, axis=0)
-    floor = high[-1]
-    importances = method(axes, points, targets, int(rng.integers(2**31)))
-    return {
-        "noise_floor": float(floor),
+        "detectable_share": detectable,
+        "surrogate_r2": cross_validated_r2(axes, points, targets, seed=seed),
+        "best_share": best,
         "parameters": {
-            axis.name: {
-                "importance": float(importances[number]),
-                "low": float(low[number]),
-                "high": float(high[number]),
-                "above_noise": bool(importances[number] > floor),
-            }
-            for number, axis in enumerate(axes)
+            axis.name: tested[axis.name] | {"f_anova": float(f_anova[k]), "ped_anova": float(ped_anova[k])}
+            for k, axis in enumerate(axes)
         },
     }
 
 
-def _dummy(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    return (rng.permutation(count) + 0.5) / count
+def _tests(
+    axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
+) -> tuple[dict[str, dict], float]:
+    """Share, interval and test of each axis alone, and the share that is found whichever axis has it."""
+    columns = {axis.name: _columns(axis, points[:, k]) for k, axis in enumerate(axes)}
+    found = {name: effects(each, targets) for name, each in columns.items()}
+    testable = [name for name, effect in found.items() if effect.is_testable]
+    p_values = adjusted_p_values([columns[name] for name in testable], targets, seed=seed)
+    untested = {"share": None, "low": None, "high": None, "p_value": None, "decided": False}
+    judged = dict.fromkeys(found, untested)
+    for name, p_value in zip(testable, p_values, strict=True):
+        low, high = found[name].interval95
+        judged[name] = {"share": float(found[name].share), "low": float(low), "high": float(high)}
+        judged[name] |= {"p_value": float(p_value), "decided": bool(p_value <= FAMILY_LEVEL)}
+    degrees = max(int(found[name].degrees) for name in testable)
+    return judged, detectable_share(degrees, len(targets), len(testable))
+
+
+def _columns(axis: Axis, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A curve of degree two for a range, the mean of each value for a choice."""
+    if axis.levels is not None:
+        return np.equal.outer(coordinates, np.arange(len(axis.levels))).astype(np.float64)
+    low, high = axis.bounds
+    centred = (coordinates - (low + high) / 2) / (high - low)
+    return np.stack([centred, centred**2], axis=-1)
 
 
 def _f_anova(
     axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
 ) -> NDArray[np.float64]:
     """Share of variance of each axis alone; whole numbers get a cell each, as all are drawn equally often."""
-    if np.ptp(targets) == 0:
-        return np.zeros(len(axes))
     distributions = {}
     for axis in axes:
         low, high = axis.bounds
@@ -156,7 +163,7 @@ def _f_anova(
 
 
 def _ped_anova(
-    axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], _seed: int, *, best_share: float
+    axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], best_share: float
 ) -> NDArray[np.float64]:
     """Divergence of the best trials' distribution from all trials', by axis, as shares of the sum."""
     if np.sort(targets)[math.ceil(best_share * len(targets)) - 1] == targets.max():  # ties make all trials the best

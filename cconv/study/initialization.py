@@ -30,7 +30,7 @@ def train_unstopped(session: Session, stage: str) -> dict:
     seed, factor = session.seed_of(stage), study.search.reduction_factor
     return {
         "initialization": variance_decomposition(seeds, configurations, study.rungs),
-        "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor, seed=seed),
+        "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor),
         "strategies": compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
     }
 

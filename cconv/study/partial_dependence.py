@@ -32,12 +32,13 @@ def partial_dependence(
         space: The space that they were drawn from.
         updates: Number of gradient updates of the errors.
         parameter: The hyperparameter.
-        useless_error: Error of predicting the mean, up to which errors count.
+        useless_error: Error up to which errors count, as in `cconv.study.importance`.
         seed: Of the forest.
 
     Returns:
         "parameter", "scale" ("linear", "log" or "choice"), "updates", "trials", "surrogate_r2"; "values", and at each
-        of them "error" with "low" and "high", the middle 80 % of trees; "points", the raw trials: "value", "error".
+        of them "error" with "low" and "high", the middle 80 % of the forest's trees, which is no confidence interval;
+        "points", the raw trials: "value", "error".
 
     Raises:
         ConfigError: If the space does not vary the hyperparameter, or fewer than ten trials have these updates.

@@ -18,18 +18,20 @@ def refine_space(session: Session, stage: str) -> dict:
 
 
 def measure_importance(session: Session, stage: str) -> dict:
-    """Importance of every hyperparameter at every rung of the random searches that the stage reads."""
-    records, rungs, seed = session.read(stage), session.study.rungs, session.seed_of(stage)
-    importance = importance_by_rung(records, session.space, rungs, seed=seed, useless_error=session.useless_error)
-    if not importance:
-        return {}
-    first = importance[0]  # all trials were measured there, and none had been stopped
-    weights = {name: each["importance"] for name, each in first["f_anova"]["parameters"].items()}
-    strongest = sorted(weights, key=weights.__getitem__, reverse=True)[:SHOWN]
+    """Importance of every hyperparameter at every rung of the random searches that the stage reads.
+
+    A trial that is given up counts as one that learned nothing, so that errors count up to where trials are given up.
+    """
+    records, space, seed = session.read(stage), session.space, session.seed_of(stage)
+    useless = min(session.useless_error, session.study.search.give_up_above)
+    importance = importance_by_rung(records, space, session.study.rungs, seed=seed, useless_error=useless)
+    first = next((entry for entry in importance if entry["parameters"]), None)  # the fewest trials had been stopped
+    if first is None:
+        return {"importance": importance}
+    shares = {name: each["share"] or 0.0 for name, each in first["parameters"].items()}
+    strongest = sorted(shares, key=shares.__getitem__, reverse=True)[:SHOWN]
     dependences = [
-        partial_dependence(
-            records, session.space, first["updates"], parameter, seed=seed, useless_error=session.useless_error
-        )
+        partial_dependence(records, space, first["updates"], parameter, seed=seed, useless_error=useless)
         for parameter in strongest
     ]
     return {"importance": importance, "partial_dependence": dependences}

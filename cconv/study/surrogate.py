@@ -99,7 +99,8 @@ def trials_at(
         records: The trials.
         updates: Number of gradient updates.
         after: Updates of the rung before.
-        useless_error: Error of predicting the mean on the validation split; it is 1 on the training split alone.
+        useless_error: Error of predicting the mean on the validation split, which is 1 on the training split alone; or
+            the error at which trials are given up, if that is smaller.
     """
     errors = {record.id: _error_at(record, updates, after, useless_error) for record in records}
     measured = [record for record in records if errors[record.id] is not None]

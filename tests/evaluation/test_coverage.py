@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from cconv.evaluation.statistics import FEWEST, crossed_interval, mean_interval, paired_ratio, why_no_interval
+from cconv.study.effects import effects
 from cconv.study.front import hypervolume, hypervolume_interval
+from cconv.study.rung_audit import FEWEST_FOR_INTERVAL, rung_measures, spearman_interval
 from cconv.study.variance import FEWEST_VALUES, compare_variances
 
 SPREADS = [(0.1, 0.3, 0.1), (0.3, 0.5, 0.3), (0.5, 1.0, 0.3)]  # of seed, unit and both
@@ -137,6 +139,79 @@ def test_the_share_of_the_seeds_is_covered_at_each_size(distribution, counts):
     check("share of the seeds", found, 1000)
 
 
+def of_range(rng, shape):
+    """Columns of a range as `effects` takes them, and a straight effect of variance 1."""
+    drawn = rng.uniform(-1, 1, shape)
+    return np.stack([drawn, drawn**2], axis=-1), math.sqrt(3) * drawn
+
+
+def of_choice(rng, shape, values=3):
+    """Columns of a choice, and an effect of variance 1."""
+    drawn, effect = rng.integers(values, size=shape), np.linspace(-1, 1, values)
+    return np.equal.outer(drawn, np.arange(values)).astype(float), (effect / effect.std())[drawn]
+
+
+def of_others(rng, shape):
+    """What other hyperparameters and luck do to the error, with variance 1: two ranges, a switch and noise."""
+    ranges = sum(weight * math.sqrt(3) * rng.uniform(-1, 1, shape) for weight in (0.7, 0.4))
+    return ranges + 0.5 * rng.choice([-1, 1], shape) + math.sqrt(0.1) * rng.normal(size=shape)
+
+
+HYPERPARAMETERS = {"range": of_range, "choice": of_choice, "switch": lambda rng, shape: of_choice(rng, shape, 2)}
+RESIDUALS = {"normal": lambda rng, shape: rng.normal(size=shape), "of others": of_others}
+STRENGTHS = (0.05, 0.2, 0.5)  # shares of the variance
+
+
+def coverage_of_a_share(rng, name, residuals, share, shape) -> float:
+    """Share of (samples, trials) whose interval holds the share of the variance."""
+    columns, effect = HYPERPARAMETERS[name](rng, shape)
+    targets = math.sqrt(share) * effect + math.sqrt(1 - share) * RESIDUALS[residuals](rng, shape)
+    low, high = effects(columns, targets).interval95
+    return float(np.mean((low <= share) & (share <= high)))
+
+
+@pytest.mark.parametrize("trials", [24, 36, 100])
+@pytest.mark.parametrize("name", HYPERPARAMETERS)
+def test_the_share_of_a_hyperparameter_is_covered(name, trials):
+    rng, times = np.random.default_rng(5), 200
+    cases = [(residuals, share) for residuals in RESIDUALS for share in STRENGTHS]
+    found = [coverage_of_a_share(rng, name, *case, (times, trials)) for case in cases]
+    check(f"share of a {name}", float(np.mean(found)), times * len(cases))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", STRENGTHS)
+@pytest.mark.parametrize("residuals", RESIDUALS)
+@pytest.mark.parametrize("trials", [14, 24, 36, 100])
+@pytest.mark.parametrize("name", HYPERPARAMETERS)
+def test_the_share_of_a_hyperparameter_is_covered_at_each_strength(name, trials, residuals, share):
+    rng = np.random.default_rng(6)
+    check(f"share of a {name}", coverage_of_a_share(rng, name, residuals, share, (2000, trials)), 2000)
+
+
+def rank_correlation(rng, trials, correlation) -> Simulated:
+    """Spearman's of the errors at a rung and at the full budget, whose logarithms are normal."""
+    noise = rng.normal(size=(2, trials))
+    at_full = correlation * noise[0] + math.sqrt(1 - correlation**2) * noise[1]
+    found = rung_measures(noise[0], at_full, top=3, kept=4)["spearman"]
+    return Simulated(spearman_interval(found, trials), 6 / math.pi * math.asin(correlation / 2))
+
+
+@pytest.mark.parametrize("trials", [12, 16, 32])
+def test_the_rank_correlation_of_a_rung_is_covered(trials):
+    rng, times = np.random.default_rng(7), 150
+    found = [coverage(lambda r=r: rank_correlation(rng, trials, r), times) for r in (0.0, 0.6, 0.9)]
+    check("rank correlation", float(np.mean(found)), 3 * times)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8, 0.9])
+@pytest.mark.parametrize("trials", [12, 16, 32])
+def test_the_rank_correlation_of_a_rung_is_covered_at_each_size(trials, correlation):
+    rng = np.random.default_rng(8)
+    check("rank correlation", coverage(lambda: rank_correlation(rng, trials, correlation), 2000), 2000)
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (1, 3), (2, 8), (3, 8), (5, 2), (5, 3)])
 def test_none_is_printed_where_none_would_cover(shape):
     """Bootstrap intervals of such tables covered 48 to 87 %; the reason is given in their place."""
@@ -147,3 +222,4 @@ def test_none_is_printed_where_none_would_cover(shape):
     assert mean_interval(np.zeros(shape)) is None
     few = rng.normal(size=FEWEST_VALUES - 1), rng.normal(size=20)
     assert compare_variances(*few)["seed_share_ci95"] is None
+    assert spearman_interval(0.9, FEWEST_FOR_INTERVAL - 1) is None

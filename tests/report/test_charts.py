@@ -177,6 +177,7 @@ def test_other_charts_show_their_records(summary):
         "recall of the best",
         "regret",
     ]
+    assert [len(axes.collections) for axes in rung_audit_chart(summary).axes] == [1, 0, 0]  # intervals of one measure
     labels = [label.get_text() for label in ablation_chart(summary).axes[0].get_yticklabels()]
     assert labels == ["baseline", "lost", "layers: 2"]
 

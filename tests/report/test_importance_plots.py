@@ -1,54 +1,56 @@
-"""Charts of importance show every hyperparameter, its interval, the floor of noise and each raw trial."""
+"""Charts of importance show every hyperparameter, its interval, what could have been found, and each raw trial."""
 
 import pytest
+from summaries import dependence
 
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
 
 
-def judged(importance, above):
-    return {"importance": importance, "low": importance / 2, "high": importance * 1.5, "above_noise": above}
+def judged(share, decided):
+    return {
+        "share": share, "low": share / 2, "high": share * 1.5, "p_value": 0.5, "decided": decided,
+        "f_anova": share / 3, "ped_anova": share / 4,
+    }  # fmt: skip
 
 
 def entry(updates, censored):
-    parameters = {"small": judged(0.02, False), "large": judged(0.6, True)}
-    found = {"noise_floor": 0.1, "parameters": parameters}
+    constant = judged(0.0, False) | dict.fromkeys(("share", "low", "high", "p_value"))
     return {
         "updates": updates,
         "trials": 40,
         "censored": censored,
         "clipped": 0,
+        "why_none": "",
+        "detectable_share": 0.33,
         "surrogate_r2": 0.5,
-        "f_anova": found,
-        "ped_anova": found,
+        "best_share": 0.1,
+        "parameters": {"small": judged(0.02, False), "constant": constant, "large": judged(0.6, True)},
     }
 
 
-def dependence(scale, values):
-    error = [0.1 * (position + 1) for position in range(len(values))]
-    return {
-        "parameter": f"of {scale}",
-        "scale": scale,
-        "updates": 1000,
-        "trials": 3,
-        "surrogate_r2": None if scale == "linear" else 0.5,
-        "values": values,
-        "error": error,
-        "low": [each / 2 for each in error],
-        "high": [each * 2 for each in error],
-        "points": [{"value": values[0], "error": 0.2}, {"value": values[-1], "error": 0.7}],
-    }
-
-
-def test_a_panel_a_rung_and_method_with_the_most_important_on_top():
-    figure = importance_chart([entry(100, False), entry(300, True)])
+def test_a_panel_a_rung_for_what_was_tested_and_what_was_estimated_with_the_largest_on_top():
+    unknown = entry(50, False) | {"why_none": "too few", "parameters": {}}
+    figure = importance_chart([unknown, entry(100, False), entry(300, True)])
     assert len(figure.axes) == 4
     first, last = figure.axes[0], figure.axes[2]
-    assert [label.get_text() for label in first.get_yticklabels()] == ["large", "small"]
+    assert [label.get_text() for label in first.get_yticklabels()] == ["large", "small", "constant"]
     assert first.yaxis_inverted()
     assert [bar.get_width() for bar in first.patches] == [0.6, 0.02]
     assert first.patches[0].get_facecolor() != first.patches[1].get_facecolor()
     assert "not stopped" in last.get_ylabel()
     assert "not stopped" not in first.get_ylabel()
+
+
+def test_only_tested_shares_have_intervals_and_the_line_is_the_detectable_share():
+    tested, estimated = importance_chart([entry(100, False)]).axes
+    segments = [segment[:, 0].tolist() for segment in tested.collections[0].get_segments()]
+    assert segments == [[0.3, pytest.approx(0.9)], [0.01, pytest.approx(0.03)]]
+    assert list(tested.lines[0].get_xdata()) == [0.33, 0.33]
+    assert [list(line.get_xdata()) for line in estimated.lines] == [
+        pytest.approx([0.2, 0.02 / 3, 0]),
+        pytest.approx([0.15, 0.005, 0]),
+    ]
+    assert not estimated.collections
 
 
 @pytest.mark.parametrize("first", ["choice", "linear", "log"])
@@ -59,4 +61,5 @@ def test_partial_dependence_shows_the_raw_trials(first):
     assert len(figure.axes) == 4
     for axes, scale in zip(figure.axes, scales, strict=True):
         assert list(axes.lines[0].get_ydata()) == [0.2, 0.7]
+        assert "middle 80 % of its trees" in axes.get_legend_handles_labels()[1]
         assert axes.get_xscale() == ("log" if scale == "log" else "linear")

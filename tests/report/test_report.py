@@ -131,6 +131,28 @@ def test_each_optional_part_can_be_missing(run, whole_run, monkeypatch):
         assert "answer" in sections(render_report(run))
 
 
+def test_what_the_trials_can_decide_is_said_before_the_bars(whole_report):
+    text, alt = without_scripts(whole_report), "Importance of hyperparameters by rung"
+    can = "with 16 trials and 3 hyperparameters, only a hyperparameter that decides at least 62 % of the variance"
+    assert 0 < text.index(can) < text.index(alt)
+    assert "After 15 updates no importance is given: 15 of 16 trials are no better than predicting the mean." in text
+    assert "Found: layers (40 %, 95 % interval 30 to 50 %)." in text
+
+
+def test_without_any_importance_the_reason_stands_in_place_of_the_chart(whole_run, monkeypatch):
+    monkeypatch.setattr(page, "_picture", lambda figure: "")
+    monkeypatch.setattr(page, "interactive_html", lambda summary: "")
+    before = whole_run.read("summary.json")
+    unknown = [entry for entry in before["importance"] if entry["why_none"]]
+    whole_run.write("summary.json", before | {"importance": unknown, "partial_dependence": None})
+    text = render_report(whole_run)
+    whole_run.write("summary.json", before)
+    assert "importance" in sections(text)
+    assert "After 15 updates no importance is given" in text
+    assert "Importance of hyperparameters by rung" not in text
+    assert "Table of all shares" not in text
+
+
 def test_every_section_says_what_is_to_be_seen_and_every_link_has_its_place(whole_report):
     text = without_scripts(whole_report)
     parts = re.split(r"<h[23][^>]*>", text)[1:]

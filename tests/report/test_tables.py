@@ -14,6 +14,7 @@ from cconv.report.tables import (
     curves_table,
     finalists_table,
     growth_table,
+    importance_table,
     rung_audit_table,
     speed_accuracy_table,
     strategies_table,
@@ -96,8 +97,18 @@ def test_optional_tables_have_a_row_a_record_and_are_empty_without(summary):
     assert len(growth) == 2 * len(summary["finalists"])
     assert list(audit["updates"]) == [15, 45, 135]
     assert list(audit["spearman_low"] < audit["spearman"]) == [False, True, True]
+    assert list(audit["why_no_interval"] == "") == [False, True, True]
     assert list(strategies["strategy"]) == ["ASHA", "ASHA", "a little, keep the best"]
-    assert all(table({}).empty for table in (growth_table, rung_audit_table, strategies_table))
+    assert all(table({}).empty for table in (growth_table, importance_table, rung_audit_table, strategies_table))
+
+
+def test_importances_have_a_row_a_rung_and_hyperparameter_where_they_are_known(summary):
+    table = importance_table(summary)
+    assert list(table["updates"]) == [45, 45, 45, 135, 135, 135]
+    assert list(table["hyperparameter"])[:3] == ["layers", "window", "message"]
+    tested = table[table["share"].notna()]
+    assert (tested["low"] <= tested["share"]).all()
+    assert (tested["share"] <= tested["high"]).all()
 
 
 def test_verdicts_agree_with_the_limits(summary):
@@ -128,7 +139,17 @@ def test_verdicts_leave_a_gap_for_finalists_that_were_not_measured(summary):
 
 
 def test_what_notebooks_import_needs_neither_ray_nor_torch():
-    modules = ("tables", "plots", "fields", "verdicts", "speed_accuracy", "interactive", "importance_plots", "page")
+    modules = (
+        "tables",
+        "decidable",
+        "plots",
+        "fields",
+        "verdicts",
+        "speed_accuracy",
+        "interactive",
+        "importance_plots",
+        "page",
+    )
     imports = ", ".join(f"cconv.report.{name}" for name in modules)
     code = f"import sys, {imports}; print({{'ray', 'torch'}} & set(sys.modules))"
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cconv.errors import ConfigError, DataError
+from cconv.study.effects import detectable_share
 from cconv.study.importance import importance_by_rung
 from cconv.study.partial_dependence import partial_dependence
 from cconv.study.records import TrialRecord
@@ -58,55 +59,117 @@ def by_word_and_rate(each, updates, rng):
 
 
 def test_shares_of_variance_are_those_of_an_additive_error():
-    entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], resamples=8, useless_error=1.0)[0]
-    judged = entry["f_anova"]["parameters"]
+    entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], useless_error=1.0)[0]
+    judged = entry["parameters"]
     word, rate = 1.5**2 * (1 / 3) * (2 / 3), 0.6**2 * 3**2 / 12
-    assert judged["word"]["importance"] == pytest.approx(word / (word + rate), abs=0.07)
-    assert judged["rate"]["importance"] == pytest.approx(rate / (word + rate), abs=0.07)
-    assert [name for name in judged if judged[name]["above_noise"]] == ["word", "rate"]
+    for name, share in (("word", word / (word + rate)), ("rate", rate / (word + rate))):
+        assert judged[name]["low"] < share < judged[name]["high"]
+        assert judged[name]["share"] == pytest.approx(share, abs=0.07)
+        assert judged[name]["f_anova"] == pytest.approx(share, abs=0.07)
+    assert [name for name in judged if judged[name]["decided"]] == ["word", "rate"]
     assert entry["surrogate_r2"] > 0.9
     assert set(judged) == {"word", "size", "rate", "count"}
-    assert json.loads(json.dumps(entry)) == entry
+    assert json.loads(json.dumps(entry, allow_nan=False)) == entry
 
 
 def test_what_the_best_have_in_common_is_important_by_ped_anova():
     records = trials(200, lambda each, updates, rng: -3 - (each["size"] == 8) + 0.1 * rng.normal())
-    entry = importance_by_rung(records, SPACE, [10], resamples=5, useless_error=1.0)
-    judged = entry[0]["ped_anova"]["parameters"]
-    assert judged["size"]["importance"] == max(each["importance"] for each in judged.values())
-    assert judged["size"]["above_noise"]
-    assert entry[0]["ped_anova"]["target_quantile"] == 0.1
-    assert sum(each["importance"] for each in judged.values()) == pytest.approx(1)
+    (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
+    found = {name: each["ped_anova"] for name, each in entry["parameters"].items()}
+    assert max(found, key=found.__getitem__) == "size"
+    assert entry["best_share"] == 0.1
+    assert sum(found.values()) == pytest.approx(1)
 
 
-def test_where_nothing_decides_nothing_is_above_noise():
-    entry = importance_by_rung(
-        trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], resamples=20, useless_error=1.0
-    )[0]
+def test_where_nothing_decides_nothing_is_found():
+    (entry,) = importance_by_rung(
+        trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], useless_error=1.0
+    )
     assert entry["surrogate_r2"] < 0.1
-    assert not any(each["above_noise"] for each in entry["f_anova"]["parameters"].values())
+    assert not any(each["decided"] for each in entry["parameters"].values())
+    assert all(each["low"] == 0 for each in entry["parameters"].values())
+
+
+def test_the_detectable_share_is_that_of_the_hardest_hyperparameter():
+    """A third value or a curve costs a degree of freedom more than a switch, so it must be stronger to be found."""
+    (entry,) = importance_by_rung(trials(40, by_word_and_rate), SPACE, [10], useless_error=1.0)
+    assert entry["detectable_share"] == detectable_share(2, 40, 4)
+
+
+def test_a_hyperparameter_that_the_trials_do_not_vary_is_not_tested():
+    records = trials(40, by_word_and_rate)
+    records = [record(n, each.parameters | {"size": 4}, {10: each.error_at(10)}) for n, each in enumerate(records)]
+    (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
+    size = entry["parameters"]["size"]
+    assert (size["share"], size["low"], size["high"], size["p_value"], size["decided"]) == (
+        None,
+        None,
+        None,
+        None,
+        False,
+    )
+    assert entry["detectable_share"] == detectable_share(2, 40, 3)
+    same = [record(n, records[0].parameters, {10: each.error_at(10)}) for n, each in enumerate(records)]
+    (entry,) = importance_by_rung(same, SPACE, [10], useless_error=1.0)
+    assert (entry["why_none"], entry["parameters"]) == ("no hyperparameter varies among the trials", {})
 
 
 def test_rungs_are_never_mixed():
     records = trials(
         40, lambda each, updates, rng: -2 - (each["size"] == 8 if updates == 10 else each["word"] == "b"), (10, 30)
     )
-    early, late = importance_by_rung(records, SPACE, [10, 30], resamples=4, useless_error=1.0)
+    early, late = importance_by_rung(records, SPACE, [10, 30], useless_error=1.0)
     for entry, name in ((early, "size"), (late, "word")):
-        judged = entry["f_anova"]["parameters"]
-        assert judged[name]["importance"] > 0.9
-    assert importance_by_rung(records, SPACE, [20], useless_error=1.0) == []
+        judged = entry["parameters"][name]
+        assert min(judged["share"], judged["f_anova"], judged["low"]) > 0.9
+    (entry,) = importance_by_rung(records, SPACE, [20], useless_error=1.0)
+    assert (entry["why_none"], entry["parameters"]) == ("0 trials were measured, and at least 10 are needed", {})
 
 
-def test_a_rung_of_survivors_says_so_and_a_rung_of_few_is_left_out():
+def test_a_rung_of_survivors_says_so_and_a_rung_of_few_has_no_importance():
     records = trials(40, by_word_and_rate, (10, 30, 90))
     stopped = [record(100 + n, drawn(np.random.default_rng(n)), {10: 0.5}, "stopped") for n in range(20)]
     few = [record(200 + n, each.parameters, {120: 0.5}) for n, each in enumerate(records[:9])]
-    entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], resamples=2, useless_error=1.0)
+    entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], useless_error=1.0)
     assert [(entry["updates"], entry["trials"], entry["censored"]) for entry in entries] == [
         (10, 60, False),
         (30, 40, True),
+        (120, 9, True),
     ]
+    assert [bool(entry["parameters"]) for entry in entries] == [True, True, False]
+
+
+def useless(count, error=50.0):
+    return [record(500 + n, drawn(np.random.default_rng(n)), {10: error}) for n in range(count)]
+
+
+@pytest.mark.parametrize(("good", "bad", "is_given"), [(10, 10, True), (9, 1, False), (10, 11, False), (1, 23, False)])
+def test_where_most_trials_are_no_better_than_the_mean_there_is_no_importance(good, bad, is_given):
+    records = [*trials(good, by_word_and_rate), *useless(bad)]
+    (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
+    assert entry["clipped"] == bad
+    assert bool(entry["parameters"]) == is_given
+    assert entry["why_none"].startswith("" if is_given else f"{bad} of {good + bad} trials are no better than")
+    assert (entry["detectable_share"] is None) == (not is_given)
+
+
+def test_equal_errors_have_no_importance():
+    (entry,) = importance_by_rung(useless(20, error=0.5), SPACE, [10], useless_error=1.0)
+    assert (entry["why_none"], entry["parameters"]) == ("all errors are equal", {})
+
+
+def test_a_trial_that_was_given_up_on_the_way_counts_as_clipped():
+    """`give_up_above` is 0.8 here, below what predicting the mean scores: errors count up to it."""
+    given_up = [record(300 + n, drawn(np.random.default_rng(n)), {7: 0.9}, "stopped") for n in range(30)]
+    (entry,) = importance_by_rung([*trials(20, by_word_and_rate), *given_up], SPACE, [10], useless_error=0.8)
+    assert (entry["trials"], entry["clipped"], entry["censored"]) == (50, 30, False)
+    assert "were given up" in entry["why_none"]
+
+
+def test_a_trial_that_ran_out_of_time_on_the_way_makes_the_rung_a_selection():
+    slow = record(300, drawn(np.random.default_rng(0)), {7: 0.01}, "stopped")
+    (entry,) = importance_by_rung([*trials(20, by_word_and_rate), slow], SPACE, [10], useless_error=1.0)
+    assert (entry["trials"], entry["censored"]) == (20, True)
 
 
 def test_a_diverged_trial_counts_as_useless_at_the_rung_on_whose_way_it_diverged():
@@ -176,7 +239,7 @@ def test_partial_dependence_refuses_what_it_cannot_show():
 
 def test_where_ties_make_all_trials_the_best_none_of_them_differs_from_all():
     """Optuna would warn on the terminal that its quantiles are the same; warnings are errors here."""
-    tied = [record(number, drawn(np.random.default_rng(number)), {10: 1.0}) for number in range(23)]
-    best = record(23, drawn(np.random.default_rng(23)), {10: 0.5})
-    (entry,) = importance_by_rung([*tied, best], SPACE, [10], resamples=3, useless_error=1.0)
-    assert all(judged["importance"] == 0 for judged in entry["ped_anova"]["parameters"].values())
+    tied = useless(23, error=0.5)
+    best = record(23, drawn(np.random.default_rng(23)), {10: 0.1})
+    (entry,) = importance_by_rung([*tied, best], SPACE, [10], useless_error=1.0)
+    assert all(judged["ped_anova"] == 0 for judged in entry["parameters"].values())
