@@ -173,6 +173,15 @@ class _Finalist(OpenModel):
     stability: dict | None
 
 
+class _Importance(OpenModel):
+    """Importance at a rung in summary.json."""
+
+    updates: _Count
+    trials: _Count
+    why_none: str
+    parameters: dict[str, dict]
+
+
 class _Summary(OpenModel):
     """summary.json, as far as every reader needs it."""
 
@@ -182,6 +191,7 @@ class _Summary(OpenModel):
     finalists: Annotated[list[_Finalist], Field(min_length=1)]
     pareto_front: list[Id]
     wall_seconds: _Error
+    importance: list[_Importance] = []
 
 
 _FORMS = {
