@@ -22,7 +22,7 @@ import zstandard
 from torch import Tensor
 
 from cconv.data.limits import memory_limit, one_line
-from cconv.data.source import SPLITS, STORED, Given, as_tensor, check_array, check_finite, uniform_masses
+from cconv.data.source import SPLITS, STORED, Given, as_floats, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import DataError
@@ -305,7 +305,7 @@ def _stack(files: list[Path], frames: list[dict], name: str, key: str, start: in
             )
         check_finite(array[None], file, name, key, start + index)
         arrays.append(array)
-    return as_tensor(np.stack(arrays))
+    return as_floats(np.stack(arrays))
 
 
 def _check_consecutive(files: list[Path], frames: list[dict], name: str) -> None:
@@ -328,7 +328,8 @@ def _boundary(file: Path, frame: Mapping) -> Boundary | None:
     check_finite(positions[None], file, "of the file", "box")
     if normals is not None:
         check_array(normals, positions.shape, file, "first frame", "box_normals")
-    return Boundary(positions=as_tensor(positions), normals=None if normals is None else as_tensor(normals))
+        check_finite(normals[None], file, "of the file", "box_normals")
+    return Boundary(positions=as_floats(positions), normals=None if normals is None else as_floats(normals))
 
 
 def _check_same_boundary(files: list[Path], boundaries: list[Boundary | None], name: str) -> None:
@@ -345,7 +346,7 @@ def _stored_masses(file: Path, frame: Mapping, name: str, num_particles: int) ->
     masses = _member(file, frame, name, "m")
     check_array(masses, (num_particles,), file, f"trajectory {name}", "m")
     check_finite(masses[None], file, name, "m")
-    return as_tensor(masses) if np.any(masses) else None
+    return as_floats(masses) if np.any(masses) else None
 
 
 def _viscosities(file: Path, frame: Mapping, name: str, num_particles: int) -> Tensor | None:
@@ -354,7 +355,8 @@ def _viscosities(file: Path, frame: Mapping, name: str, num_particles: int) -> T
     if viscosities is None or not np.any(viscosities):
         return None
     check_array(viscosities, (num_particles,), file, f"trajectory {name}", "viscosity")
-    return as_tensor(viscosities)
+    check_finite(viscosities[None], file, name, "viscosity")
+    return as_floats(viscosities)
 
 
 def _estimate_frame_dt(trajectory: Trajectory, file: Path) -> float:

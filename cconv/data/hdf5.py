@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,7 +29,7 @@ from cconv.data.metadata import (
     metadata_from_scene,
     scene_from_metadata,
 )
-from cconv.data.source import SPLITS, STORED, Given, as_tensor, check_array, check_finite, uniform_masses
+from cconv.data.source import SPLITS, STORED, Given, as_floats, as_tensor, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory, finite_difference_velocities
 from cconv.domain import Box
 from cconv.errors import DataError
@@ -266,7 +267,7 @@ def _boundary(group: h5py.Group, file: Path, name: str, types: Tensor) -> Bounda
     wall = _is_wall(types)
     if not wall.any():
         return None
-    return Boundary(positions=as_tensor(_member(group, "position", file, name)[0])[wall], normals=None)
+    return Boundary(positions=as_floats(_member(group, "position", file, name)[0])[wall], normals=None)
 
 
 def _check_complete(folder: Path, files: Iterable[Path]) -> None:
@@ -322,7 +323,7 @@ def _member(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
 
 def _types(group: h5py.Group, file: Path, name: str, particles: int | str) -> Tensor:
     """Types of the particles (N,), all of them known and at least one of them fluid."""
-    types = _required(group, "particle_type", file, name, (particles,)).long()
+    types = as_tensor(_values(group, "particle_type", file, name, (particles,))).long()
     known = [int(kind) for kind in ParticleType]
     values, counts = types.unique(return_counts=True)
     unknown = [
@@ -343,10 +344,14 @@ def _types(group: h5py.Group, file: Path, name: str, particles: int | str) -> Te
 
 
 def _required(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor:
+    return as_floats(_values(group, key, file, name, shape))
+
+
+def _values(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
     values = _member(group, key, file, name)[()]
     check_array(values, shape, file, f"trajectory {name}", key)
     check_finite(values[None], file, name, key)
-    return as_tensor(values)
+    return values
 
 
 def _optional(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[int | str, ...]) -> Tensor | None:
@@ -358,4 +363,4 @@ def _finite_frames(stored: h5py.Dataset, frames: slice, file: Path, name: str) -
     if len(values) == 0:
         raise DataError(f"{file}: trajectory {name} has {len(stored)} frames, none from {frames.start} on.")
     check_finite(values, file, name, stored.name.rsplit("/", 1)[-1], frames.start)
-    return as_tensor(values)
+    return as_floats(values)

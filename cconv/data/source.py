@@ -89,6 +89,12 @@ def as_tensor(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(array, dtype=dtype, order="C"))
 
 
+def as_floats(array: np.ndarray) -> Tensor:
+    """As `as_tensor`, with whole numbers as float32."""
+    values = as_tensor(array)
+    return values if values.is_floating_point() else values.float()
+
+
 def check_array(array: object, shape: tuple[int | str, ...], file: Path, place: str, key: str) -> None:
     """Raise `DataError` unless `array` is a numeric array of `shape`; strings in `shape` match any length."""
     wanted = ", ".join(str(axis) for axis in shape)
@@ -103,11 +109,12 @@ def check_array(array: object, shape: tuple[int | str, ...], file: Path, place: 
 
 
 def check_finite(frames: np.ndarray, file: Path, name: str, key: str, first_frame: int = 0) -> None:
-    """Raise `DataError` that names the first of `frames` (T, ...) with a NaN or an infinity."""
-    finite = np.isfinite(frames).reshape(len(frames), -1).all(axis=1)
+    """Raise `DataError` that names the first of `frames` (T, ...) with a NaN or what no unit makes sense of."""
+    limit = np.float64(LARGEST)  # float16 could not hold it
+    finite = ((-limit <= frames) & (frames <= limit)).reshape(len(frames), -1).all(axis=1)
     if not finite.all():
         frame = first_frame + int(np.argmin(finite))
         raise DataError(
-            f"{file}: trajectory {name}, frame {frame}: `{key}` has a NaN or infinite value; "
+            f"{file}: trajectory {name}, frame {frame}: `{key}` has a NaN or a value beyond {LARGEST:g}; "
             "the simulation blew up: cut the trajectory before this frame or drop it."
         )

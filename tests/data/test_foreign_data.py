@@ -14,6 +14,7 @@ from cconv.data.dataset import open_dataset
 from cconv.errors import ConfigError, DataError
 
 SHAPE = (6, 4, 2)  # of `position` in the small files
+WALLS = {"boundary_position": np.zeros((3, 2)), "boundary_normal": np.tile([0.0, 1.0], (3, 1))}
 
 
 def read_all(folder):
@@ -94,6 +95,27 @@ def test_positions_that_must_not_be_read_are_refused(tmp_path, store, words):
     with pytest.raises(DataError, match=words) as refusal:
         read_all(tmp_path / "set")
     assert "train.h5" in str(refusal.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300, 1e13])
+@pytest.mark.parametrize("key", ["position", "velocity", "mass", "viscosity", "boundary_position", "boundary_normal"])
+def test_numbers_that_no_unit_makes_sense_of_are_refused(tmp_path, key, value):
+    write_hdf5(tmp_path, velocity=np.ones(SHAPE), mass=np.ones(4), viscosity=np.ones(4), **WALLS)
+    with h5py.File(tmp_path / "train.h5", "r+") as file:
+        stored = file[f"00000/{key}"][()].astype("f8")
+        stored.flat[0] = value
+        del file[f"00000/{key}"]
+        file[f"00000/{key}"] = stored
+    with pytest.raises(DataError, match=f"`{key}` has a NaN or a value beyond 1e.12"):
+        read_all(tmp_path)
+
+
+def test_whole_numbers_are_read_as_floating_point(tmp_path):
+    write_hdf5(tmp_path, velocity=np.ones(SHAPE, int), mass=np.ones(4, "u1"), viscosity=np.ones(4, int))
+    for trajectory in read_all(tmp_path):
+        assert all(
+            values.is_floating_point() for values in (trajectory.velocities, trajectory.masses, trajectory.viscosities)
+        )
 
 
 def test_a_trajectory_in_another_file_is_refused(tmp_path):
