@@ -8,6 +8,7 @@ import fcntl
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -116,13 +117,16 @@ def on_loopback_alone() -> Iterator[None]:
 
 
 def check_token_of_cluster(address: str) -> None:
-    """Raise `ConfigError` unless the user has a token for the cluster at `address`."""
+    """Raise `ConfigError` unless the user has a token for the cluster at `address` that nobody else can read."""
     if not _has_token():
         raise ConfigError(
             f"--address {address}: no token for this cluster, and one without a token runs anybody's code; make one "
             "with `(umask 077; ray get-auth-token --generate)`, copy ~/.ray/auth_token to every node (or name it in "
             "RAY_AUTH_TOKEN_PATH), start the nodes with RAY_AUTH_MODE=token."
         )
+    path = _token_file()
+    if path is not None:
+        _check_only_owner_reads(path, address)
 
 
 def _has_token() -> bool:
@@ -131,6 +135,24 @@ def _has_token() -> bool:
         return AuthenticationTokenLoader.instance().has_token(ignore_auth_mode=True)
     except AuthenticationError:  # the file that the environment names is not there or empty
         return False
+
+
+def _token_file() -> Path | None:
+    """The file that Ray reads the token from; None where the environment holds the token itself."""
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return None
+    return Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+
+
+def _check_only_owner_reads(path: Path, address: str) -> None:
+    status = path.stat()
+    is_ours = status.st_uid == os.getuid()
+    if is_ours and not status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return
+    fault, cure = "is open to other users", f"chmod 600 {path}"
+    if not is_ours:
+        fault, cure = "belongs to another user", f"chown $USER {path} && {cure}"
+    raise ConfigError(f"--address {address}: {path} {fault}, and who reads the token runs code as you; `{cure}`.")
 
 
 def _made_folder() -> Path:
