@@ -1,6 +1,8 @@
 """SIGKILL at random times, again and again: what was finished stays byte by byte, and nothing is left behind.
 
-A port belongs to a process, so that where no process is left no port is.
+A process is known by what it cannot put off together: the mark in its environment, its session, and the folder for
+temporary files in its arguments, its working folder or its open files. (Agents of Ray write their titles over their
+environment and arguments.) A port belongs to a process, so that where no process is left no port is.
 """
 
 import itertools
@@ -32,7 +34,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
 class Victim:
-    """Runs commands whose processes are known by a mark in their environment, and kills them.
+    """Runs commands whose processes are known, also those that outlive their parents, and kills them.
 
     Args:
         place: Folder for temporary files, of these commands alone.
@@ -40,7 +42,7 @@ class Victim:
     """
 
     def __init__(self, place, seed):
-        self.place, self.mark, self.kills = place, uuid.uuid4().hex, 0
+        self.place, self.mark, self.kills, self.sessions = place, uuid.uuid4().hex, 0, set()
         self._random = random.Random(seed)
 
     def run(self, command, longest):
@@ -48,6 +50,7 @@ class Victim:
         environment = os.environ | {MARK: self.mark, "TMPDIR": str(self.place)}
         streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
         with subprocess.Popen(command, env=environment, start_new_session=True, **streams) as process:
+            self.sessions.add(process.pid)
             try:
                 process.wait(self._random.uniform(0, longest))
                 assert process.returncode == 0, process.stderr.read()
@@ -66,7 +69,7 @@ class Victim:
             yield parent / f"killed_{number}"
 
     def await_end(self):
-        """Wait until no process with the mark is left."""
+        """Wait until no process of the commands is left."""
         deadline = time.monotonic() + ENDS_BY_ITSELF
         while (left := list(self._processes())) and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -75,10 +78,16 @@ class Victim:
     def _processes(self):
         for process in psutil.process_iter():
             try:
-                if process.environ().get(MARK) == self.mark and process.status() != psutil.STATUS_ZOMBIE:
+                if process.status() != psutil.STATUS_ZOMBIE and self._owns(process):
                     yield process
-            except (psutil.NoSuchProcess, psutil.AccessDenied):
+            except (psutil.NoSuchProcess, psutil.AccessDenied, OSError):  # it ended meanwhile
                 continue
+
+    def _owns(self, process):
+        if os.getsid(process.pid) in self.sessions or process.environ().get(MARK) == self.mark:
+            return True
+        links = [Path(f"/proc/{process.pid}/cwd"), *Path(f"/proc/{process.pid}/fd").iterdir()]
+        return any(str(self.place) in name for name in [*process.cmdline(), *map(os.readlink, links)])
 
 
 @contextmanager
