@@ -11,9 +11,10 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
+import psutil
 from ray._private import ray_constants
 from ray._raylet import AuthenticationTokenLoader, Config
 from ray.exceptions import AuthenticationError
@@ -105,15 +106,34 @@ def token_of_this_run(folder: Path) -> Iterator[None]:
         AuthenticationTokenLoader.instance().reset_cache()
 
 
-@contextmanager
-def on_loopback_alone() -> Iterator[None]:
+def on_loopback_alone() -> AbstractContextManager[None]:
     """Let Ray's processes listen on 127.0.0.1 only, which Ray itself does where it supports no clusters."""
-    before = ray_constants.ENABLE_RAY_CLUSTER
-    ray_constants.ENABLE_RAY_CLUSTER = False
+    return _constant_of_ray("ENABLE_RAY_CLUSTER", False)
+
+
+def asking_once() -> AbstractContextManager[None]:
+    """Let Ray ask a cluster that does not let it in once, not twenty times; each takes 40 seconds."""
+    return _constant_of_ray("NUM_REDIS_GET_RETRIES", 1)
+
+
+@contextmanager
+def _constant_of_ray(name: str, value) -> Iterator[None]:
+    before = getattr(ray_constants, name)
+    setattr(ray_constants, name, value)
     try:
         yield
     finally:
-        ray_constants.ENABLE_RAY_CLUSTER = before
+        setattr(ray_constants, name, before)
+
+
+def kill_processes_of(folder: Path) -> None:
+    """End what Ray started in a private folder and left there when it did not come up."""
+    for process in psutil.Process().children(recursive=True):
+        try:
+            if str(folder) in " ".join(process.cmdline()):
+                process.kill()
+        except psutil.NoSuchProcess:
+            continue
 
 
 def check_token_of_cluster(address: str) -> None:
