@@ -25,12 +25,12 @@ from studies import write_search
 from cconv.study.records import RunFolder
 
 KILLS = int(os.environ.get("CCONV_KILLS", "50"))
-ENDS_BY_ITSELF = 120  # seconds within which what a killed process started notices that it is gone
+ENDS_BY_ITSELF = 120  # seconds within which what a killed process started notices it; agents of Ray need 60
 SHARED_MEMORY = Path("/dev/shm")
 OF_AN_ATTEMPT = ("attempt", "hanging.txt")  # may outlive a killed training that had come to its end
 MARK = "CCONV_TEST_MARK"
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(4 * 3600)]
 
 
 class Victim:
