@@ -8,11 +8,13 @@ import fcntl
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
+import psutil
 from ray._private import ray_constants
 from ray._raylet import AuthenticationTokenLoader, Config
 from ray.exceptions import AuthenticationError
@@ -104,25 +106,47 @@ def token_of_this_run(folder: Path) -> Iterator[None]:
         AuthenticationTokenLoader.instance().reset_cache()
 
 
-@contextmanager
-def on_loopback_alone() -> Iterator[None]:
+def on_loopback_alone() -> AbstractContextManager[None]:
     """Let Ray's processes listen on 127.0.0.1 only, which Ray itself does where it supports no clusters."""
-    before = ray_constants.ENABLE_RAY_CLUSTER
-    ray_constants.ENABLE_RAY_CLUSTER = False
+    return _constant_of_ray("ENABLE_RAY_CLUSTER", False)
+
+
+def asking_once() -> AbstractContextManager[None]:
+    """Let Ray ask a cluster that does not let it in once, not twenty times; each takes 40 seconds."""
+    return _constant_of_ray("NUM_REDIS_GET_RETRIES", 1)
+
+
+@contextmanager
+def _constant_of_ray(name: str, value) -> Iterator[None]:
+    before = getattr(ray_constants, name)
+    setattr(ray_constants, name, value)
     try:
         yield
     finally:
-        ray_constants.ENABLE_RAY_CLUSTER = before
+        setattr(ray_constants, name, before)
+
+
+def kill_processes_of(folder: Path) -> None:
+    """End what Ray started in a private folder and left there when it did not come up."""
+    for process in psutil.Process().children(recursive=True):
+        try:
+            if str(folder) in " ".join(process.cmdline()):
+                process.kill()
+        except psutil.NoSuchProcess:
+            continue
 
 
 def check_token_of_cluster(address: str) -> None:
-    """Raise `ConfigError` unless the user has a token for the cluster at `address`."""
+    """Raise `ConfigError` unless the user has a token for the cluster at `address` that nobody else can read."""
     if not _has_token():
         raise ConfigError(
             f"--address {address}: no token for this cluster, and one without a token runs anybody's code; make one "
             "with `(umask 077; ray get-auth-token --generate)`, copy ~/.ray/auth_token to every node (or name it in "
             "RAY_AUTH_TOKEN_PATH), start the nodes with RAY_AUTH_MODE=token."
         )
+    path = _token_file()
+    if path is not None:
+        _check_only_owner_reads(path, address)
 
 
 def _has_token() -> bool:
@@ -131,6 +155,24 @@ def _has_token() -> bool:
         return AuthenticationTokenLoader.instance().has_token(ignore_auth_mode=True)
     except AuthenticationError:  # the file that the environment names is not there or empty
         return False
+
+
+def _token_file() -> Path | None:
+    """The file that Ray reads the token from; None where the environment holds the token itself."""
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return None
+    return Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+
+
+def _check_only_owner_reads(path: Path, address: str) -> None:
+    status = path.stat()
+    is_ours = status.st_uid == os.getuid()
+    if is_ours and not status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return
+    fault, cure = "is open to other users", f"chmod 600 {path}"
+    if not is_ours:
+        fault, cure = "belongs to another user", f"chown $USER {path} && {cure}"
+    raise ConfigError(f"--address {address}: {path} {fault}, and who reads the token runs code as you; `{cure}`.")
 
 
 def _made_folder() -> Path:

@@ -19,7 +19,6 @@ os.environ.update(
     TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S="0",
     TUNE_GLOBAL_CHECKPOINT_S="1000000",  # Ray's own state is never restored
     TUNE_WARN_THRESHOLD_S="60",
-    RAY_NUM_REDIS_GET_RETRIES="1",  # of joining a cluster; each takes 40 seconds
 )
 
 import ray  # noqa: E402, its settings are read at import
@@ -32,8 +31,10 @@ from cconv.errors import ConfigError, is_disk_full  # noqa: E402
 from cconv.study.attempt import Attempt  # noqa: E402
 from cconv.study.config import StudyConfig, TrainingConfig  # noqa: E402
 from cconv.study.private_ray import (  # noqa: E402
+    asking_once,
     check_token_of_cluster,
     demand_tokens,
+    kill_processes_of,
     on_loopback_alone,
     private_folder,
     remove_private_folders,
@@ -47,6 +48,7 @@ from cconv.training.loop import TrainingState  # noqa: E402
 
 QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # what fails is in our records
 OBJECT_STORE_BYTES = 2**30
+STARTS = 3  # of a Ray of our own; on a busy machine it may take longer than the 30 seconds that it gives itself
 CONNECTION_SECONDS = 5.0
 RESTARTS = 2  # of a training whose process or node died; it goes on from its last evaluation
 HANGING = 2.0  # times its limit after which a training's process is ended from outside
@@ -85,14 +87,20 @@ def remove_left_behind(folder: Path) -> None:
 def _start(cores: int, folder: Path) -> None:
     """Start a Ray on this machine whose files are in `folder`."""
     settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES, "_temp_dir": str(folder / "ray")}
-    try:
-        ray.init("local", num_cpus=cores, **settings, **QUIET)
-    except (OSError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(
-            f"Ray does not start on this machine ({reason}); if it is the place for temporary files, set TMPDIR to a "
-            "short folder with room that you can write to."
-        ) from error
+    for left in reversed(range(STARTS)):
+        try:
+            ray.init("local", num_cpus=cores, **settings, **QUIET)
+            return
+        except Exception as error:  # of no kind of its own where it took too long
+            ray.shutdown()
+            kill_processes_of(folder)
+            if left:
+                continue
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"Ray does not start on this machine ({reason}); if it is the place for temporary files, set TMPDIR "
+                "to a short folder with room that you can write to."
+            ) from error
 
 
 def _join(address: str) -> None:
@@ -101,7 +109,8 @@ def _join(address: str) -> None:
         if port.isdigit():  # Ray itself would try for minutes
             socket.create_connection((host, int(port)), CONNECTION_SECONDS).close()
         check_token_of_cluster(address)
-        ray.init(address=address, **QUIET)
+        with asking_once():
+            ray.init(address=address, **QUIET)
     except (OSError, RuntimeError, ValueError, RayError) as error:
         if isinstance(error, ConfigError):
             raise

@@ -69,6 +69,30 @@ def test_a_table_that_was_left_goes_on_as_if_it_had_not_been(tmp_path, stop_afte
     assert restored.entries() == whole.entries()
 
 
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_those_that_passed_a_rung_are_those_that_went_on_beyond_it(tmp_path, seed, factor):
+    file, rungs = RungFile(tmp_path / "rungs.json"), rungs_up_to(27, 3, factor)
+    table = RungTable(rungs, factor)
+    run(table, curves(seed))
+    reached = {entry["updates"]: set(entry["recorded"]) for entry in table.entries()}
+    counts = {entry["updates"]: (entry["trials"], entry["passed"]) for entry in table.passed()}
+    assert counts == {
+        rung: (len(reached[rung]), len(reached[later])) for rung, later in zip(rungs[:-1], rungs[1:], strict=True)
+    }
+    file.write("random", table)
+    assert file.table("random", rungs, factor).passed() == table.passed()
+
+
+def test_a_rung_that_no_trial_reached_has_no_share_and_asking_records_nothing():
+    table = RungTable([3, 9, 27], 3)
+    assert table.passed() == []
+    table.record("first", 3, 1.0)
+    before = table.entries()
+    assert table.passed() == [{"updates": 3, "trials": 1, "passed": 1}]
+    assert table.entries() == before
+
+
 def test_stages_share_the_file(tmp_path):
     file = RungFile(tmp_path / "rungs.json")
     for stage in ("random", "adaptive"):

@@ -9,7 +9,7 @@ from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
 from cconv.evaluation.metrics import frame_errors, normalized_mse
 from cconv.study import closed_form
-from cconv.study.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, single_layers
+from cconv.study.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, layer_id, propose, single_layers
 from cconv.study.records import RunFolder
 from cconv.study.space import SearchSpace, load_space
 from cconv.training.field_model import NetworkConfig
@@ -52,6 +52,58 @@ def test_a_draw_holds_as_many_of_each_basis():
     assert sum(layer["basis"] == "radial" for layer in drawn) == 5
     assert drawn == _draw(layers, 20, seed=0) != _draw(layers, 20, seed=1)
     assert _draw(layers, 100, seed=0) == layers
+
+
+LAYERS = single_layers(
+    space_of(basis=["grid", "radial"], kernel_size=[2, 3, 4], radial_terms=[8, 16, 32], window=["none", "poly6"]),
+    NetworkConfig(),
+    3,
+)
+RADIAL = [layer for layer in LAYERS if layer["basis"] == "radial"]
+GRID = [layer for layer in LAYERS if layer["basis"] == "grid"]
+
+
+def changes(layer, other):
+    """Settings that both layers have and that differ."""
+    return {name for name in layer.keys() & other if layer[name] != other[name]}
+
+
+def without(layers, tried):
+    known = {layer_id(layer) for layer in tried}
+    return [layer for layer in layers if layer_id(layer) not in known]
+
+
+def winners_of(*layers):
+    return [SimpleNamespace(parameters=layer) for layer in layers]
+
+
+@pytest.mark.parametrize("winners", [RADIAL[:1], RADIAL[:2], [GRID[0], RADIAL[0]], [RADIAL[0], RADIAL[-1]]])
+def test_every_other_number_of_terms_of_every_winner_comes_first_and_once(winners):
+    untried = without(LAYERS, winners)
+    proposed = propose(winners_of(*winners), untried)
+    near = [layer for layer in RADIAL if any(changes(layer, winner) == {"radial_terms"} for winner in winners)]
+    assert sorted(map(layer_id, proposed)) == sorted(layer_id(layer) for layer in near if layer in untried)
+
+
+def test_then_come_the_layers_one_change_away_from_the_most_accurate_winner_that_has_any_left():
+    first, second = GRID[0], GRID[-1]
+    untried = without(LAYERS, [first, second])
+    proposed = propose(winners_of(first, second), untried)
+    assert proposed
+    assert all(len(changes(layer, first)) == 1 for layer in proposed)
+    proposed_later = propose(winners_of(first, second), without(untried, proposed))
+    assert proposed_later
+    assert all(len(changes(layer, second)) == 1 for layer in proposed_later)
+
+
+@pytest.mark.parametrize("winners", [[GRID[0]], [RADIAL[0]], [RADIAL[0], GRID[0]], [GRID[0], RADIAL[-1], RADIAL[0]]])
+def test_proposals_to_the_same_winners_end_when_nothing_is_left_near_them(winners):
+    untried = without(LAYERS, winners)
+    while batch := propose(winners_of(*winners), untried):
+        assert all(layer in untried for layer in batch)
+        untried = without(untried, batch)
+    assert all(len(changes(layer, winner)) != 1 for layer in untried for winner in winners)
+    assert propose([], LAYERS) == []
 
 
 @pytest.fixture

@@ -30,6 +30,7 @@ def study_file(tmp_path):
 def token(tmp_path, monkeypatch):
     """A token of a cluster, in a file that the environment names."""
     path = tmp_path / "auth_token"
+    path.touch(mode=0o600)
     path.write_text("a" * 64)
     monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(path))
     return path

@@ -15,7 +15,7 @@ from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
 from cconv.study.config import load_study
-from cconv.study.private_ray import PREFIX, private_folder, remove_private_folders
+from cconv.study.private_ray import PREFIX, check_token_of_cluster, private_folder, remove_private_folders
 from cconv.study.ray_pool import ray_pool
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
@@ -100,6 +100,56 @@ def test_another_user_can_neither_read_the_token_nor_join(running):
     assert "joined" not in join(address, path, user=NOBODY, RAY_AUTH_MODE="token")
     assert join(address, user=NOBODY, RAY_AUTH_MODE="disabled").startswith("refused AuthenticationError")
     assert join(address, user=NOBODY, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=path.read_text()) == "joined\n"
+
+
+@pytest.fixture
+def token_file(tmp_path, monkeypatch):
+    """The file of a cluster's token, where Ray looks for it if the environment names none."""
+    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
+    monkeypatch.delenv("RAY_AUTH_TOKEN_PATH", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path = tmp_path / ".ray" / "auth_token"
+    path.parent.mkdir()
+    path.write_text("a" * 64)
+    path.chmod(0o600)
+    return path
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o620, 0o604, 0o644, 0o777])
+def test_a_token_of_a_cluster_that_others_can_read_or_write_is_one_line_that_says_what_to_do(token_file, mode):
+    token_file.chmod(mode)
+    refused = pytest.raises(ConfigError, match=f"--address there:1: .* open to other users.*`chmod 600 {token_file}`")
+    with refused as caught:
+        check_token_of_cluster("there:1")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+def test_a_token_of_a_cluster_that_belongs_to_another_user_is_one_line_that_says_what_to_do(token_file):
+    os.chown(token_file, NOBODY, NOBODY)
+    refused = pytest.raises(ConfigError, match=f"belongs to another user.*`chown .* && chmod 600 {token_file}`")
+    with refused as caught:
+        check_token_of_cluster("there:1")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o400])
+def test_a_token_of_a_cluster_for_its_owner_alone_is_taken_from_where_ray_finds_it(
+    token_file, tmp_path, monkeypatch, mode
+):
+    token_file.chmod(mode)
+    check_token_of_cluster("there:1")
+    elsewhere = token_file.rename(tmp_path / "elsewhere")
+    with pytest.raises(ConfigError, match="no token for this cluster"):
+        check_token_of_cluster("there:1")
+    monkeypatch.setenv("RAY_AUTH_TOKEN_PATH", str(elsewhere))
+    check_token_of_cluster("there:1")
+
+
+def test_a_token_in_the_environment_needs_no_file(token_file, monkeypatch):
+    token_file.chmod(0o644)
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
+    check_token_of_cluster("there:1")
 
 
 def test_folders_of_killed_runs_go_and_those_in_use_stay(tmp_path, monkeypatch):

@@ -3,18 +3,22 @@
 import errno
 import json
 import os
+import signal
+import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 import ray
 from conftest import SMOKE
+from processes import PATIENCE
 
 from cconv.errors import ConfigError
 from cconv.study.config import load_study
 from cconv.study.problem import Problem, load_problem, open_study_data, with_data_path
-from cconv.study.ray_pool import RayPool, ray_pool
+from cconv.study.ray_pool import STARTS, RayPool, _start, ray_pool
 from cconv.study.records import TrialFolder
 from cconv.study.trial_queue import Job, NothingStops, TrialQueue
 
@@ -126,8 +130,42 @@ def test_an_error_of_the_judge_ends_the_run_as_it_is_and_gives_no_training_an_ou
     assert not TrialFolder(tmp_path / "trial_0").ended
 
 
+@pytest.fixture
+def slow_ray(monkeypatch, tmp_path):
+    """Make Ray come up at a given try only; what earlier ones leave behind are processes that it started."""
+    left = []
+
+    def come_up_at(number):
+        def init(*_, _temp_dir, **settings):
+            if len(left) + 1 < number:
+                left.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)", _temp_dir]))
+                raise Exception("The current node timed out during startup.")
+
+        monkeypatch.setattr("cconv.study.ray_pool.ray", SimpleNamespace(init=init, shutdown=lambda: None))
+        return left
+
+    yield come_up_at
+    for process in left:
+        process.kill()
+        process.wait()
+
+
+def test_a_ray_that_does_not_come_up_in_time_is_started_again_and_leaves_nothing(slow_ray, tmp_path):
+    left = slow_ray(STARTS)
+    _start(1, tmp_path)
+    assert len(left) == STARTS - 1
+    assert all(process.wait(PATIENCE) == -signal.SIGKILL for process in left)
+
+
+def test_a_ray_that_never_comes_up_is_one_line(slow_ray, tmp_path):
+    slow_ray(STARTS + 1)
+    with pytest.raises(ConfigError, match="Ray does not start on this machine .*timed out") as caught:
+        _start(1, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "no-such-host.invalid:6379", "nonsense"])
-def test_a_cluster_that_is_not_there_is_one_line(address, tmp_path):
+def test_a_cluster_that_is_not_there_is_one_line(address, cores, tmp_path):
     missing = pytest.raises(ConfigError, match=f"--address {address}.*ray start --head")
     with missing as caught, ray_pool(None, None, tmp_path, address):
         pass
