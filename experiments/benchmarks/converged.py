@@ -1,0 +1,122 @@
+"""Published sizes trained until more updates bring nothing, a training at a time, so that results add up over days.
+
+    python experiments/benchmarks/converged.py --data FOLDER baseline:1 published_difference:1 thesis_best:1
+    python experiments/benchmarks/converged.py
+
+The trainings are those of the stage `converge` of experiments/dpi_converged.toml: model, seed, one budget. One that
+was cut short goes on where it was; one that ended is a file in results/converged and is not trained again. Without
+trainings, the table and the chart of all files are written.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from rich.progress import track
+
+from cconv.evaluation.metrics import frame_errors, mean_predictor_error, normalized_mse
+from cconv.study.config import StudyConfig, load_study
+from cconv.study.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
+from cconv.study.records import TrialFolder, write_json
+from cconv.study.space import load_space
+from cconv.study.trial import run_trial
+from cconv.training.checkpoint import load_model
+
+STUDY = Path(__file__).parents[1] / "dpi_converged.toml"
+RESULTS = Path(__file__).parent / "results" / "converged"
+
+
+def hyperparameters(study: StudyConfig) -> dict[str, dict]:
+    """Hyperparameters of the models that the stage `converge` trains, by name."""
+    baseline = load_space(study.search.space, study).baseline
+    included = study.stages["finalists"].include
+    return {name: dict(baseline) | dict(included.get(name, {})) for name in study.stages["converge"].of}
+
+
+def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) -> dict:
+    """Train one model with one seed, and read its errors on the validation and the test split.
+
+    Args:
+        study: Study file with its data.
+        model: Name among `hyperparameters`.
+        seed: Seed of the initial weights.
+        updates: Budget.
+        place: Folder for its progress.
+
+    Returns:
+        "model", "seed", "updates", "parameters", "log" (updates, seconds, valid_normalized_mse), and the normalized MSE
+        of the best checkpoint, "valid" and "test", beside those of predicting the mean.
+    """
+    dataset = open_study_data(study.data, study.seeds.data)
+    problem = load_problem(study, dataset)
+    training = study.training.model_copy(update={"updates": updates})
+    folder = TrialFolder(place)
+    trial = run_trial(
+        problem, hyperparameters(study)[model], study.network, training, folder, stage="train", init_seed=seed,
+        data_seed=study.seeds.data, provenance=provenance(study, dataset),
+    )  # fmt: skip
+    for _ in track(trial, f"{model}, seed {seed}", total=updates // training.evaluate_every):
+        pass
+    best = load_model(folder.checkpoint)
+    samples = {"valid": problem.valid_samples, "test": list(study_samples(study, dataset, "test"))}
+    errors = {split: normalized_mse(frame_errors(best, each)) for split, each in samples.items()}
+    mean = {split: normalized_mse(mean_predictor_error(each, problem.train_samples)) for split, each in samples.items()}
+    log = [{key: entry[key] for key in ("updates", "seconds", "valid_normalized_mse")} for entry in folder.read().log]
+    facts = {"model": model, "seed": seed, "updates": updates, "num_parameters": best.num_parameters, "log": log}
+    return facts | errors | {"mean_predictor": mean}
+
+
+def table(results: list[Mapping]) -> pd.DataFrame:
+    """Mean errors over seeds, a row for each model and budget."""
+    rows = pd.DataFrame([{key: each[key] for key in ("model", "updates", "seed", "valid", "test")} for each in results])
+    groups = rows.groupby(["model", "updates"])
+    spread = groups["test"].agg(["min", "max"]).add_prefix("test_")
+    return groups[["valid", "test"]].mean().join([spread, groups["seed"].count().rename("seeds")]).reset_index()
+
+
+def chart(results: list[Mapping]) -> Figure:
+    """Validation error against updates and against training seconds, a line for each training."""
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    names = list(dict.fromkeys(each["model"] for each in results))
+    for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
+        for each in results:
+            curve = pd.DataFrame(each["log"])
+            axes.plot(curve[x], curve["valid_normalized_mse"], color=f"C{names.index(each['model'])}", lw=1.2)
+        axes.set(xscale="log", yscale="log", xlabel=label)
+    for number, name in enumerate(names):
+        panels[1].plot([], [], color=f"C{number}", label=name)
+    panels[0].set_ylabel("validation error (normalized MSE)")
+    panels[1].legend()
+    return figure
+
+
+def main() -> None:
+    """Train what was asked for; without trainings, sum up."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trainings", nargs="*", metavar="MODEL:SEED")
+    parser.add_argument("--data", help="folder of the DPI dam break")
+    parser.add_argument("--updates", type=int, default=6000)
+    parser.add_argument("--runs", type=Path, default=Path("runs/converged"), help="folder for what is being trained")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # so that several trainings may run side by side
+    for name in arguments.trainings:
+        model, seed = name.split(":")
+        file = f"{model}_{arguments.updates}_seed_{int(seed)}"
+        if not (RESULTS / f"{file}.json").exists():
+            study = with_data_path(load_study(STUDY, []), arguments.data)
+            found = train(study, model, int(seed), arguments.updates, arguments.runs / file)
+            write_json(RESULTS / f"{file}.json", found)
+            print(f"{file}: validation {found['valid']:.4g}, test {found['test']:.4g}")
+    if not arguments.trainings:
+        results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*_seed_*.json"))]
+        print(table(results).to_string(index=False, float_format=lambda value: f"{value:.4g}"))
+        chart(results).savefig(RESULTS / "curves.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()
