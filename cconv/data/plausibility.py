@@ -4,6 +4,7 @@ Files that cannot be what they claim are refused by their readers. Here is what 
 the trajectory, the frame and the particle that show it first, and what to do.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 
@@ -113,8 +114,8 @@ class _Fluid:
     """The fluid particles of a trajectory, as the checks look at them.
 
     Attributes:
-        positions: (T, N, D), float64.
-        velocities: (T, N, D), float64.
+        positions: (T, N, D).
+        velocities: (T, N, D).
         steps: Minimum-image displacements from frame to frame, (T - 1, N, D).
         speeds: (T, N).
         masses: (N,).
@@ -123,8 +124,8 @@ class _Fluid:
 
     def __init__(self, trajectory: Trajectory, scene: Scene, fluid: Tensor):
         self.trajectory, self.scene, self.numbers = trajectory, scene, fluid
-        self.positions = trajectory.positions[:, fluid].double()
-        self.velocities = trajectory.velocities[:, fluid].double()
+        self.positions = trajectory.positions[:, fluid]
+        self.velocities = trajectory.velocities[:, fluid]
         self.steps = scene.box.displacement(self.positions[1:], self.positions[:-1])
         self.speeds = torch.linalg.vector_norm(self.velocities, dim=-1)
         self.masses = trajectory.masses[fluid]
@@ -136,7 +137,7 @@ class _Fluid:
         lower = torch.tensor([low if wraps else 0.0 for low, wraps in zip(box.lower, box.periodic, strict=True)])
         lengths = [length if wraps else 0.0 for length, wraps in zip(box.lengths, box.periodic, strict=True)]
         tree = cKDTree((box.wrap(positions) - lower).numpy(), boxsize=lengths)
-        distances, numbers = tree.query((box.wrap(self.positions[frame]) - lower).numpy(), k=2)
+        distances, numbers = tree.query((box.wrap(self.positions[frame].double()) - lower).numpy(), k=2)
         numbers = stored.numpy()[numbers]
         itself = numbers[:, 1] == self.numbers.numpy()  # of particles at the same place, either may come first
         return distances[:, 1], np.where(itself, numbers[:, 0], numbers[:, 1])
@@ -183,7 +184,7 @@ def _frozen(fluid: _Fluid) -> Iterator[_Seen]:
 def _outside(fluid: _Fluid) -> Iterator[_Seen]:
     box, spacing = fluid.scene.box, fluid.scene.particle_spacing
     open_axes = [axis for axis, wraps in enumerate(box.periodic) if not wraps]
-    lower, upper = (torch.tensor(bounds)[open_axes].double() for bounds in (box.lower, box.upper))
+    lower, upper = (torch.tensor(bounds)[open_axes] for bounds in (box.lower, box.upper))
     positions = fluid.positions[..., open_axes]
     beyond = torch.maximum(lower - positions, positions - upper)
     margin = (
@@ -207,7 +208,8 @@ def _far(fluid: _Fluid) -> Iterator[_Seen]:
     if not open_axes:
         return
     distances = torch.linalg.vector_norm(positions - positions.median(dim=1, keepdim=True).values, dim=-1)
-    usual = distances.quantile(0.9, dim=1, keepdim=True).clamp(min=fluid.scene.particle_spacing)
+    nine_of_ten = math.ceil(0.9 * distances.shape[1])
+    usual = distances.kthvalue(nine_of_ten, dim=1, keepdim=True).values.clamp(min=fluid.scene.particle_spacing)
     if first := _first(distances > FAR_AWAY * usual):
         frame, particle, count = first
         times = float(distances[frame, particle] / usual[frame])
@@ -237,7 +239,7 @@ def _crossing(fluid: _Fluid) -> Iterator[_Seen]:
 
 
 def _speeds(fluid: _Fluid) -> Iterator[_Seen]:
-    mean = float(fluid.speeds.mean())
+    mean = float(fluid.speeds.mean(dtype=torch.float64))
     if first := _first(fluid.speeds > LARGEST_SPEED * mean):
         frame, particle, count = first
         times = float(fluid.speeds[frame, particle]) / mean
@@ -254,7 +256,7 @@ def _velocities(fluid: _Fluid) -> Iterator[_Seen]:
     if fluid.scene.velocity_source != STORED or len(fluid.steps) == 0:
         return
     said = (fluid.velocities[1:] + fluid.velocities[:-1]) / 2 * fluid.scene.frame_dt
-    moved, expected = float(fluid.steps.square().sum().sqrt()), float(said.square().sum().sqrt())
+    moved, expected = (float(values.double().norm()) for values in (fluid.steps, said))
     smallest = AT_REST * fluid.scene.particle_spacing * np.sqrt(fluid.steps[..., 0].numel())
     if max(moved, expected) <= smallest:
         return

@@ -23,6 +23,7 @@ from cconv.study.config import StudyConfig, load_study
 from cconv.study.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
 from cconv.study.records import TrialFolder, write_json
 from cconv.study.space import load_space
+from cconv.study.stages import BASELINE
 from cconv.study.trial import run_trial
 from cconv.training.checkpoint import load_model
 
@@ -32,9 +33,8 @@ RESULTS = Path(__file__).parent / "results" / "converged"
 
 def hyperparameters(study: StudyConfig) -> dict[str, dict]:
     """Hyperparameters of the models that the stage `converge` trains, by name."""
-    baseline = load_space(study.search.space, study).baseline
-    included = study.stages["finalists"].include
-    return {name: dict(baseline) | dict(included.get(name, {})) for name in study.stages["converge"].of}
+    named = {BASELINE: load_space(study.search.space, study).baseline, **study.stages["finalists"].include}
+    return {name: named[name] for name in study.stages["converge"].of}
 
 
 def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) -> dict:
