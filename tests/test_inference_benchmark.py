@@ -19,7 +19,7 @@ def benchmark(benchmark_script, monkeypatch, generator):
     monkeypatch.setattr(module, "DIM", scene.dim)
     monkeypatch.setattr(module, "SEARCHES", [(dim, 100, periodic) for dim in (1, 2, 3) for periodic in (False, True)])
     monkeypatch.setattr(module, "CHECKED", dict(list(module.CHECKED.items())[:6]))
-    monkeypatch.setattr(cost, "_peak_megabytes", lambda *arguments: 1.0)
+    monkeypatch.setattr(cost, "peak_megabytes", lambda load, models, *others: dict.fromkeys(models, 1.0))
     monkeypatch.setattr(cost, "measure_growth", partial(cost.measure_growth, sizes=(50, 100)))
     return module
 

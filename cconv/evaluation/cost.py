@@ -3,15 +3,12 @@
 import itertools
 import math
 import random
-import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -21,6 +18,7 @@ from cconv.data.targets import VECTOR_TASKS
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
 from cconv.evaluation.cost_model import Surroundings, estimate
+from cconv.evaluation.memory import peak_megabytes
 from cconv.neighbors import radius_graph
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
@@ -120,6 +118,7 @@ def measure_costs(
     calls[ANALYTIC] = _analytic_call(task, kernel, frames, scene)
     with _threads(threads):
         times = _times_in_turn(calls, repeats)
+    peaks = peak_megabytes(load, models, frames[0], scene, threads)
     particles = statistics.fmean(_num_fluid(frame) for frame in frames)
     costs = {}
     for name, model in loaded.items():
@@ -128,7 +127,7 @@ def measure_costs(
             **medians,
             turns_ms=_turns(times[name]),
             us_per_particle=1e3 * medians["ms_per_frame"] / max(particles, 1),
-            peak_mb=_peak_megabytes(load, models[name], frames[0], scene, threads),
+            peak_mb=peaks[name],
             flops_per_particle=flops_per_particle(model, inputs_without_density(frames[0], scene)),
             threads=threads,
             num_particles=particles,
@@ -371,32 +370,6 @@ def _exponent(times: Sequence[FrameTime]) -> float:
         return math.nan
     sizes, medians = zip(*((time.num_particles, time.ms_per_frame) for time in times), strict=True)
     return statistics.linear_regression([math.log(n) for n in sizes], [math.log(ms) for ms in medians]).slope
-
-
-def _peak_megabytes(load: Callable[[Path], FieldModel], path: Path, frame: Frame, scene: Scene, threads: int) -> float:
-    """Growth of the peak memory of a fresh process by two predictions."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_memory_of_predictions, load, path, frame, scene, threads).result()
-
-
-def _memory_of_predictions(
-    load: Callable[[Path], FieldModel], path: Path, frame: Frame, scene: Scene, threads: int
-) -> float:
-    torch.set_num_threads(threads)
-    model = load(path)
-    before = _peak_resident_megabytes()
-    for _ in range(2):
-        model.predict_frame(frame, scene)
-    return _peak_resident_megabytes() - before
-
-
-def _peak_resident_megabytes() -> float:
-    """Peak memory of this process. On Linux `getrusage` would hand on the parent's peak, so /proc is asked."""
-    status = Path("/proc/self/status")
-    if not status.is_file():
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
 
 
 @contextmanager

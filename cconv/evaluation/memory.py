@@ -1,0 +1,63 @@
+"""How much memory a prediction takes, measured in processes of their own."""
+
+import resource
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import torch
+
+from cconv.data.trajectory import Frame, Scene
+from cconv.training.field_model import FieldModel
+
+Load = Callable[[Path], FieldModel]
+
+
+def peak_megabytes(
+    load: Load, models: Mapping[str, Path], frame: Frame, scene: Scene, threads: int
+) -> dict[str, float]:
+    """Growth of the peak memory of a fresh process by two predictions of each model, MB.
+
+    Args:
+        load: Reads a checkpoint folder.
+        models: Checkpoint folder of each model.
+        frame: Frame to predict.
+        scene: Its scene.
+        threads: Torch threads.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        found = pool.submit(_of_each, load, tuple(models.values()), frame, scene, threads).result()
+    return dict(zip(models, found, strict=True))
+
+
+def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame, scene: Scene, threads: int) -> list[float]:
+    """One process after another for each model, forked from this one, so that imports are paid for once."""
+    context, found = get_context("fork"), []
+    for path in paths:
+        receiver, sender = context.Pipe(duplex=False)
+        child = context.Process(target=_send_growth, args=(sender, load, path, frame, scene, threads))
+        child.start()
+        sender.close()  # so that a child that dies is an end of file here
+        found.append(receiver.recv())
+        child.join()
+    return found
+
+
+def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame, scene: Scene, threads: int) -> None:
+    torch.set_num_threads(threads)
+    model = load(path)
+    before = _peak_resident_megabytes()
+    for _ in range(2):
+        model.predict_frame(frame, scene)
+    sender.send(_peak_resident_megabytes() - before)
+
+
+def _peak_resident_megabytes() -> float:
+    """Peak memory of this process. On Linux `getrusage` would hand on the parent's peak, so /proc is asked."""
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
