@@ -189,22 +189,22 @@ def try_data(folder, change, data, commands=tuple(COMMANDS)):
         call(copy, data, data.draw(st.sampled_from(commands)))
 
 
+CHANGES = {"hdf5": change_hdf5, "records": change_records}
+kinds = pytest.mark.parametrize("kind", CHANGES)
+
+
+@kinds
 @examples(40)
 @given(data=st.data())
-def test_a_changed_hdf5_folder_is_read_or_refused_in_one_line(folders, data):
-    try_data(folders / "hdf5", change_hdf5, data)
+def test_a_changed_folder_is_read_or_refused_in_one_line(folders, kind, data):
+    try_data(folders / kind, CHANGES[kind], data)
 
 
-@examples(40)
+@kinds
+@examples(15)
 @given(data=st.data())
-def test_a_changed_folder_of_records_is_read_or_refused_in_one_line(folders, data):
-    try_data(folders / "records", change_records, data)
-
-
-@examples(30)
-@given(data=st.data())
-def test_any_option_is_taken_or_refused_in_one_line(folders, data):
-    try_data(folders / data.draw(st.sampled_from(["hdf5", "records"])), lambda *_: None, data)
+def test_any_option_is_taken_or_refused_in_one_line(folders, kind, data):
+    try_data(folders / kind, lambda *_: None, data)
 
 
 @pytest.mark.parametrize("content", BOMBS, ids=lambda content: repr(content[:6]))
@@ -216,23 +216,17 @@ def test_a_file_that_unpacks_to_far_more_is_refused_in_one_line(folders, content
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
+@kinds
 @examples(400)
 @given(data=st.data())
-def test_hundreds_of_hdf5_folders(folders, data):
-    try_data(folders / "hdf5", change_hdf5, data)
+def test_hundreds_of_folders(folders, kind, data):
+    try_data(folders / kind, CHANGES[kind], data)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
-@examples(400)
+@kinds
+@examples(100)
 @given(data=st.data())
-def test_hundreds_of_folders_of_records(folders, data):
-    try_data(folders / "records", change_records, data)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-@examples(200)
-@given(data=st.data())
-def test_hundreds_of_options(folders, data):
-    try_data(folders / data.draw(st.sampled_from(["hdf5", "records"])), lambda *_: None, data)
+def test_a_hundred_options(folders, kind, data):
+    try_data(folders / kind, lambda *_: None, data)

@@ -5,8 +5,9 @@ the trajectory, the frame and the particle that show it first, and what to do.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -79,7 +80,7 @@ def first_of_each(findings: Sequence[DataFinding]) -> list[DataFinding]:
     counts: dict[str, list[DataFinding]] = {}
     for finding in findings:
         counts.setdefault(finding.check, []).append(finding)
-    return [DataFinding(**asdict(first) | {"others": len(rest)}) for first, *rest in counts.values()]
+    return [replace(first, others=len(rest)) for first, *rest in counts.values()]
 
 
 def trajectory_findings(trajectory: Trajectory, scene: Scene) -> list[DataFinding]:
@@ -97,7 +98,7 @@ def trajectory_findings(trajectory: Trajectory, scene: Scene) -> list[DataFindin
             text=seen.text,
         )
         for check, look in CHECKS.items()
-        if (seen := next(look(view), None)) is not None
+        if (seen := look(view)) is not None
     ]
 
 
@@ -130,7 +131,18 @@ class _Fluid:
         self.speeds = torch.linalg.vector_norm(self.velocities, dim=-1)
         self.masses = trajectory.masses[fluid]
 
-    def nearest(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def open_axes(self) -> list[int]:
+        """Axes that are not periodic."""
+        return [axis for axis, wraps in enumerate(self.scene.box.periodic) if not wraps]
+
+    @cached_property
+    def nearest(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """What `_nearest_in` finds, by frame, evenly spaced from the first to the last; none for a single particle."""
+        frames = evenly_spaced(len(self.positions), FRAMES_WITH_NEIGHBORS) if len(self.numbers) > 1 else ()
+        return {frame: self._nearest_in(frame) for frame in frames}
+
+    def _nearest_in(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Distance of each fluid particle to the nearest other particle, fluid or wall, and that one's number, (N,)."""
         stored = (self.trajectory.particle_types != ParticleType.PAD).nonzero()[:, 0]
         box, positions = self.scene.box, self.trajectory.positions[frame, stored].double()
@@ -151,157 +163,141 @@ def _first(where: Tensor) -> tuple[int, int, int] | None:
     return frame, int(where[frame].int().argmax()), int(where[frame].sum())
 
 
-def _masses(fluid: _Fluid) -> Iterator[_Seen]:
-    if first := _first(~(fluid.masses > 0)[None]):
-        _, particle, count = first
-        mass = float(fluid.masses[particle])
-        yield _Seen(0, particle, f"mass {mass:g} is not positive ({count} fluid particles); give --mass")
+def _first_beyond(values: Tensor, limit: float, text: str) -> _Seen | None:
+    """The first of values (T, N) beyond a limit; `text` may name the "{value}" and the "{count}" in its frame."""
+    if (first := _first(values > limit)) is None:
+        return None
+    frame, particle, count = first
+    return _Seen(frame, particle, text.format(value=f"{float(values[frame, particle]):.3g}", count=count))
 
 
-def _zeros(fluid: _Fluid) -> Iterator[_Seen]:
+def _masses(fluid: _Fluid) -> _Seen | None:
+    if (first := _first(~(fluid.masses > 0)[None])) is None:
+        return None
+    frame, particle, count = first
+    mass = float(fluid.masses[particle])
+    return _Seen(frame, particle, f"mass {mass:g} is not positive ({count} fluid particles); give --mass")
+
+
+def _zeros(fluid: _Fluid) -> _Seen | None:
     zero = (fluid.positions == 0).flatten(1).all(dim=1)
-    if fluid.positions.shape[1] > 1 and zero.any():
-        yield _Seen(
-            int(zero.int().argmax()),
-            None,
-            f"all positions are zero, in {int(zero.sum())} frames: they were never written; cut the trajectory before",
-        )
+    if len(fluid.numbers) < 2 or not zero.any():
+        return None
+    text = f"all positions are zero, in {int(zero.sum())} frames: they were never written; cut the trajectory before"
+    return _Seen(int(zero.int().argmax()), None, text)
 
 
-def _frozen(fluid: _Fluid) -> Iterator[_Seen]:
+def _frozen(fluid: _Fluid) -> _Seen | None:
     frame_dt, spacing = fluid.scene.frame_dt, fluid.scene.particle_spacing
     still = (fluid.steps == 0).flatten(1).all(dim=1)
-    moving = fluid.speeds[1:].amax(dim=1) * frame_dt > AT_REST * spacing
-    if (still & moving).any():
-        frame = int((still & moving).int().argmax())
-        yield _Seen(
-            frame + 1,
-            None,
-            "all positions are those of the frame before, although particles move; drop repeated frames",
-        )
+    frozen = still & (fluid.speeds[1:].amax(dim=1) * frame_dt > AT_REST * spacing)
+    if not frozen.any():
+        return None
+    text = "all positions are those of the frame before, although particles move; drop repeated frames"
+    return _Seen(int(frozen.int().argmax()) + 1, None, text)
 
 
-def _outside(fluid: _Fluid) -> Iterator[_Seen]:
-    box, spacing = fluid.scene.box, fluid.scene.particle_spacing
-    open_axes = [axis for axis, wraps in enumerate(box.periodic) if not wraps]
-    lower, upper = (torch.tensor(bounds)[open_axes] for bounds in (box.lower, box.upper))
-    positions = fluid.positions[..., open_axes]
-    beyond = torch.maximum(lower - positions, positions - upper)
-    margin = (
-        spacing if fluid.scene.has_boundary else max(box.lengths)
-    )  # without walls, a fluid may leave where it began
-    if first := _first((beyond > margin).any(dim=-1)):
-        frame, particle, count = first
-        distance = float(beyond[frame, particle].max()) / spacing
-        yield _Seen(
-            frame,
-            particle,
-            f"it is {distance:.3g} particle spacings outside the box ({count} fluid particles are); correct `bounds`, "
-            "or drop what has left the scene",
-        )
+def _outside(fluid: _Fluid) -> _Seen | None:
+    """Particles that left the box through an open axis; where there are no walls, those that are far from it."""
+    box, spacing, axes = fluid.scene.box, fluid.scene.particle_spacing, fluid.open_axes
+    if not axes:
+        return None
+    lower, upper = (torch.tensor(bounds)[axes] for bounds in (box.lower, box.upper))
+    positions = fluid.positions[..., axes]
+    beyond = torch.maximum(lower - positions, positions - upper).amax(dim=-1)
+    return _first_beyond(
+        beyond / spacing,
+        1.0 if fluid.scene.has_boundary else max(box.lengths) / spacing,
+        "it is {value} particle spacings outside the box ({count} fluid particles are); correct `bounds`, or drop what "
+        "has left the scene",
+    )
 
 
-def _far(fluid: _Fluid) -> Iterator[_Seen]:
+def _far(fluid: _Fluid) -> _Seen | None:
     """Particles far from all others on open axes, as the box of data without bounds holds them by definition."""
-    open_axes = [axis for axis, wraps in enumerate(fluid.scene.box.periodic) if not wraps]
-    positions = fluid.positions[..., open_axes]
-    if not open_axes:
-        return
+    if not fluid.open_axes:
+        return None
+    positions = fluid.positions[..., fluid.open_axes]
     distances = torch.linalg.vector_norm(positions - positions.median(dim=1, keepdim=True).values, dim=-1)
     nine_of_ten = math.ceil(0.9 * distances.shape[1])
     usual = distances.kthvalue(nine_of_ten, dim=1, keepdim=True).values.clamp(min=fluid.scene.particle_spacing)
-    if first := _first(distances > FAR_AWAY * usual):
-        frame, particle, count = first
-        times = float(distances[frame, particle] / usual[frame])
-        yield _Seen(
-            frame,
-            particle,
-            f"it is {times:.3g} times as far from the middle of the fluid as nine of ten particles ({count} fluid "
-            f"particles are beyond {FAR_AWAY}); the simulation lost it: drop it, or cut the trajectory before",
+    return _first_beyond(
+        distances / usual,
+        FAR_AWAY,
+        "it is {value} times as far from the middle of the fluid as nine of ten particles ({count} fluid particles are "
+        f"beyond {FAR_AWAY}); the simulation lost it: drop it, or cut the trajectory before",
+    )
+
+
+def _crossing(fluid: _Fluid) -> _Seen | None:
+    for axis in fluid.open_axes:
+        name = "xyz"[axis]
+        seen = _first_beyond(
+            fluid.steps[..., axis].abs(),
+            fluid.scene.box.lengths[axis] / 2,
+            f"it moves {{value}} along {name} from the frame before, more than half of the box ({{count}} fluid "
+            f"particles do), although {name} is not periodic; correct `periodic_boundary_conditions`",
         )
+        if seen is not None:
+            return replace(seen, frame=seen.frame + 1)  # a step leads to the next frame
+    return None
 
 
-def _crossing(fluid: _Fluid) -> Iterator[_Seen]:
-    box = fluid.scene.box
-    for axis, (length, wraps) in enumerate(zip(box.lengths, box.periodic, strict=True)):
-        if wraps:
-            continue
-        steps = fluid.steps[..., axis].abs()
-        if first := _first(steps > length / 2):
-            frame, particle, count = first
-            step = float(steps[frame, particle])
-            yield _Seen(
-                frame + 1,
-                particle,
-                f"it moves {step:.3g} along {'xyz'[axis]} from the frame before, more than half of the box ({count} "
-                f"fluid particles do), although {'xyz'[axis]} is not periodic; correct `periodic_boundary_conditions`",
-            )
+def _speeds(fluid: _Fluid) -> _Seen | None:
+    return _first_beyond(
+        fluid.speeds / fluid.speeds.mean(dtype=torch.float64),
+        LARGEST_SPEED,
+        "its speed is {value} times the mean of the trajectory ({count} fluid particles are beyond "
+        f"{LARGEST_SPEED}); look at this frame, and cut the trajectory before if it blew up",
+    )
 
 
-def _speeds(fluid: _Fluid) -> Iterator[_Seen]:
-    mean = float(fluid.speeds.mean(dtype=torch.float64))
-    if first := _first(fluid.speeds > LARGEST_SPEED * mean):
-        frame, particle, count = first
-        times = float(fluid.speeds[frame, particle]) / mean
-        yield _Seen(
-            frame,
-            particle,
-            f"its speed is {times:.3g} times the mean of the trajectory ({count} fluid particles are beyond "
-            f"{LARGEST_SPEED}); look at this frame, and cut the trajectory before if it blew up",
-        )
-
-
-def _velocities(fluid: _Fluid) -> Iterator[_Seen]:
+def _velocities(fluid: _Fluid) -> _Seen | None:
     """Stored velocities in other units than length per time, or another time between frames."""
     if fluid.scene.velocity_source != STORED or len(fluid.steps) == 0:
-        return
+        return None
     said = (fluid.velocities[1:] + fluid.velocities[:-1]) / 2 * fluid.scene.frame_dt
     moved, expected = (float(values.double().norm()) for values in (fluid.steps, said))
     smallest = AT_REST * fluid.scene.particle_spacing * np.sqrt(fluid.steps[..., 0].numel())
-    if max(moved, expected) <= smallest:
-        return
     ratio = moved / expected if expected > 0 else np.inf
     low, high = VELOCITY_RANGE
-    if not low <= ratio <= high:
-        yield _Seen(
-            0,
-            None,
-            f"particles move {ratio:.3g} times as far from frame to frame as their velocities say; give --frame-dt, or "
-            "store velocities as length per time",
-        )
+    if max(moved, expected) <= smallest or low <= ratio <= high:
+        return None
+    text = (
+        f"particles move {ratio:.3g} times as far from frame to frame as their velocities say; give --frame-dt, or "
+        "store velocities as length per time"
+    )
+    return _Seen(0, None, text)
 
 
-def _spacing(fluid: _Fluid) -> Iterator[_Seen]:
-    low, high = SPACING_RANGE
+def _spacing(fluid: _Fluid) -> _Seen | None:
     spacing = fluid.scene.particle_spacing
-    for frame in (0, len(fluid.positions) - 1) if fluid.positions.shape[1] > 1 else ():
-        distance = float(np.median(fluid.nearest(frame)[0]))
-        if not low * spacing <= distance <= high * spacing:
-            yield _Seen(
-                frame,
-                None,
-                f"half of the particles have their nearest neighbour within {distance:.3g}, which does not fit a "
-                f"particle spacing of {spacing:g}; give --particle-spacing",
+    low, high = SPACING_RANGE
+    medians = {frame: float(np.median(distances)) for frame, (distances, _) in fluid.nearest.items()}
+    for frame in (0, len(fluid.positions) - 1):
+        if frame in medians and not low * spacing <= medians[frame] <= high * spacing:
+            text = (
+                f"half of the particles have their nearest neighbour within {medians[frame]:.3g}, which does not fit a "
+                f"particle spacing of {spacing:g}; give --particle-spacing"
             )
+            return _Seen(frame, None, text)
+    return None
 
 
-def _duplicates(fluid: _Fluid) -> Iterator[_Seen]:
-    if fluid.positions.shape[1] < 2:
-        return
-    for frame in evenly_spaced(len(fluid.positions), FRAMES_WITH_NEIGHBORS):
-        distances, others = fluid.nearest(frame)
+def _duplicates(fluid: _Fluid) -> _Seen | None:
+    for frame, (distances, others) in fluid.nearest.items():
         same = distances <= SAME_PLACE * min(fluid.scene.particle_spacing, float(np.median(distances)))
         if same.any():
             particle = int(same.argmax())
-            yield _Seen(
-                frame,
-                particle,
+            text = (
                 f"particle {others[particle]} is at the same place ({int(same.sum())} fluid particles share theirs); "
-                "drop copies, or mind that the simulation lets particles merge",
+                "drop copies, or mind that the simulation lets particles merge"
             )
+            return _Seen(frame, particle, text)
+    return None
 
 
-CHECKS: dict[str, Callable[[_Fluid], Iterator[_Seen]]] = {
+CHECKS: dict[str, Callable[[_Fluid], _Seen | None]] = {
     "masses": _masses,
     "zeros": _zeros,
     "frozen": _frozen,

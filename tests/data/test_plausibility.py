@@ -1,6 +1,7 @@
 """Data that can be read and make no sense are named, with frame and particle; what a solver wrote is not."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -110,8 +111,7 @@ def test_what_makes_no_sense_is_named_with_frame_and_particle(check, damage, fra
     damage(trajectory)
     found = {finding.check: finding for finding in trajectory_findings(trajectory, scene)}
     assert (found[check].frame, found[check].particle) == (frame, particle)
-    with pytest.raises(AssertionError, match=words):
-        raise AssertionError(str(found[check]))
+    assert re.search(words, str(found[check]))
     json.dumps(found[check].as_dict(), allow_nan=False)
 
 
