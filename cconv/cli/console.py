@@ -42,6 +42,12 @@ def show_progress(items: Iterable, label: str) -> Iterator:
         yield from progress.track(items, description=visible(label))
 
 
+def print_findings(findings: Iterable, console: Console = errors) -> None:
+    """A line for each thing in the data that does not make sense."""
+    for finding in findings:
+        console.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
+
+
 def print_json(value: object) -> None:
     """Print plain values as JSON that a program can read."""
     print(json.dumps(value, indent=2, allow_nan=False))

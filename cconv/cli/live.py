@@ -9,7 +9,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress
 from rich.table import Table
 
-from cconv.cli.console import plain_column
+from cconv.cli.console import plain_column, print_findings
 
 ROWS = 12
 
@@ -52,8 +52,7 @@ class StudyDisplay:
 
     def on_data(self, findings: Sequence[str]) -> None:
         """Print a line for everything that does not make sense."""
-        for finding in findings:
-            self.console.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
+        print_findings(findings, self.console)
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
         """Begin a stage with an empty table."""

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.cli.data import Force, FrameDt, Mass, Spacing, parse_vector
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
@@ -228,6 +228,5 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
     dataset = open_study_data(config.data, config.seeds.data)
-    for finding in dataset_findings(dataset, show_progress):
-        errors.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
+    print_findings(dataset_findings(dataset, show_progress))
     return config, load_problem(config, dataset, show_progress), dataset

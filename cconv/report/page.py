@@ -106,8 +106,8 @@ def _finished_parts(run: RunFolder, summary: Mapping) -> dict:
 
 def _importance_chart(summary: Mapping) -> dict[str, str]:
     """The chart of importances, if there are any: at some rungs too little is known for bars."""
-    known = [entry for entry in summary.get("importance", []) if entry["parameters"]]
-    return {"importance": _picture(importance_chart(known))} if known else {}
+    entries = summary.get("importance", [])
+    return {"importance": _picture(importance_chart(entries))} if any(entry["parameters"] for entry in entries) else {}
 
 
 def _lead(text: str) -> tuple[str, str]:

@@ -97,13 +97,9 @@ def _why_none(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArra
         )
     if np.ptp(targets) == 0:
         return "all errors are equal"
-    varies = any(_is_testable(axis, column) for axis, column in zip(axes, points.T, strict=True))
+    columns = map(_columns, axes, points.T)
+    varies = any(effects(each, targets).is_testable for each in columns)
     return "" if varies else "no hyperparameter varies among the trials"
-
-
-def _is_testable(axis: Axis, coordinates: NDArray[np.float64]) -> bool:
-    values = len(np.unique(coordinates))
-    return values > 1 and (axis.levels is None or values < len(coordinates))
 
 
 def _measure(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int) -> dict:

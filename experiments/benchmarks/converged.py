@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from rich.progress import track
 
 from cconv.evaluation.metrics import frame_errors, mean_predictor_error, normalized_mse
+from cconv.report.plots import budget_chart
 from cconv.study.config import StudyConfig, load_study
 from cconv.study.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
 from cconv.study.records import TrialFolder, write_json
@@ -80,19 +81,9 @@ def table(results: list[Mapping]) -> pd.DataFrame:
 
 def chart(results: list[Mapping]) -> Figure:
     """Validation error against updates and against training seconds, a line for each training."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    names = list(dict.fromkeys(each["model"] for each in results))
-    for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
-        for each in results:
-            curve = pd.DataFrame(each["log"])
-            axes.plot(curve[x], curve["valid_normalized_mse"], color=f"C{names.index(each['model'])}", lw=1.2)
-        axes.set(xscale="log", yscale="log", xlabel=label)
-    for number, name in enumerate(names):
-        panels[1].plot([], [], color=f"C{number}", label=name)
-    panels[0].set_ylabel("validation error (normalized MSE)")
-    panels[1].legend()
-    return figure
+    facts = [{"name": each["model"], "seed": each["seed"], "retrained": True, "log": each["log"]} for each in results]
+    curves = pd.DataFrame([{**fact, **entry} for fact in facts for entry in fact["log"]])
+    return budget_chart(curves, list(dict.fromkeys(each["model"] for each in results)))
 
 
 def main() -> None:
