@@ -8,8 +8,8 @@ _HOMES = {
     "Box": "cconv.domain",
     "Dataset": "cconv.data.dataset",
     "Edges": "cconv.neighbors",
-    "fit_closed_form": "cconv.training.closed_form",
-    "load_model": "cconv.training.checkpoint",
+    "fit_closed_form": "cconv.models.closed_form",
+    "load_model": "cconv.models.checkpoint",
     "open_dataset": "cconv.data.dataset",
     "radius_graph": "cconv.neighbors",
 }
@@ -20,6 +20,6 @@ def __getattr__(name: str):
     # Loaded when first used: torch takes seconds, and `cconv --help` needs none of it.
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    if name in ("nn", "sph"):
+    if name in ("networks", "nn", "sph"):
         return import_module(f"cconv.{name}")
     raise AttributeError(f"module 'cconv' has no attribute {name!r}")

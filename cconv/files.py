@@ -1,6 +1,7 @@
-"""Text files that may come from anybody: read whole or refused in one line, before they cost memory or time."""
+"""Text files: read whole or refused in one line, before they cost memory or time; written whole or not at all."""
 
 import json
+import os
 import re
 import stat
 import tomllib
@@ -120,3 +121,19 @@ def _depth(value: object) -> int:
         level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
         depth += 1
     return depth
+
+
+def write_json(path: Path, value) -> None:
+    """Write JSON under a temporary name, then rename, so that a reader never finds half a file."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file under a temporary name, then rename it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}-{os.getpid()}")
+    try:
+        part.write_text(text)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

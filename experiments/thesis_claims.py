@@ -17,14 +17,15 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from cconv.errors import DataError
+from cconv.files import write_json
 from cconv.report.decidable import decidable
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
-from cconv.study.effects import effects
-from cconv.study.importance import importance_by_rung
-from cconv.study.partial_dependence import partial_dependence
-from cconv.study.records import TrialRecord, write_json
-from cconv.study.rung_audit import spearman_interval
-from cconv.study.space import Choice, FloatRange, IntRange, SearchSpace
+from cconv.study.declared.domains import Choice, FloatRange, IntRange, SearchSpace
+from cconv.study.evidence.effects import effects
+from cconv.study.evidence.importance import importance_by_rung
+from cconv.study.evidence.partial_dependence import partial_dependence
+from cconv.study.evidence.rung_audit import spearman_interval
+from cconv.study.records.trials import TrialRecord
 
 SIZE, KERNEL, EXTENT = "num_parameters", "kernel_size", "filter_extent"
 SHAPE = (KERNEL, "hidden_units", "input_channels", "hidden_layers")  # what the number of parameters follows from

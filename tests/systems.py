@@ -8,7 +8,7 @@ from cconv.data.targets import Sample, make_sample
 from cconv.data.trajectory import Boundary, Frame, Scene, Trajectory
 from cconv.domain import Box
 from cconv.sph.kernels import CubicSpline
-from cconv.study.problem import Problem
+from cconv.study.running.problem import Problem
 
 
 def periodic_scene(particles_per_side: int = 8) -> Scene:

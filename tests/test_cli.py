@@ -12,7 +12,7 @@ from rich.text import Text
 
 from cconv.cli.console import PlainConsole, plain_column
 from cconv.cli.live import StudyDisplay, TrainingBar
-from cconv.study.records import FORMAT, RunFolder
+from cconv.study.records.run_folder import FORMAT, RunFolder
 
 HOSTILE = "[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"
 SHOWN = r"[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"

@@ -12,7 +12,7 @@ from outcomes import assert_one_clear_line
 from processes import PATIENCE
 
 from cconv import load_model
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 
 def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):

@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from systems import problem
 from torch import Generator
 
-from cconv.study.config import load_study
+from cconv.models.checkpoint import save_model
+from cconv.models.model import NetworkConfig
+from cconv.study.declared.search_space import load_space
+from cconv.study.declared.study_file import load_study
 from cconv.study.pipeline import begin_study
-from cconv.study.problem import provenance, with_data_path
-from cconv.study.records import RunFolder
-from cconv.study.space import load_space
-from cconv.training.checkpoint import save_model
-from cconv.training.field_model import NetworkConfig
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.running.problem import provenance, with_data_path
 
 REPOSITORY = SMOKE.parents[1]
 STUDY = SMOKE.read_text()

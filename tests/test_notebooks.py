@@ -11,7 +11,7 @@ from nbclient import NotebookClient
 from processes import PATIENCE
 from summaries import explanation, whole_summary
 
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 ANALYSIS = Path(__file__).parents[1] / "analysis"
 NOTEBOOKS = sorted(ANALYSIS.glob("*.ipynb"))

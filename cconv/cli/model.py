@@ -27,9 +27,9 @@ def train(
     Its tables network and training are used; without a table network that is the published baseline. The checkpoint of
     the smallest validation error stands in DIR/checkpoint, also after Ctrl-C.
     """
-    from cconv.study.problem import provenance
-    from cconv.study.records import TrialFolder
-    from cconv.study.trial import run_trial
+    from cconv.study.records.trials import TrialFolder
+    from cconv.study.running.problem import provenance
+    from cconv.study.running.trial import run_trial
 
     config, problem, dataset = _study_and_problem(study, data, settings, out)
     folder = TrialFolder(out)
@@ -70,11 +70,11 @@ def fit(
     The study's table network says which layer, e.g. experiments/closed_form.toml: layers = 1, basis = "radial" or
     "grid", message, relative_cutoff, window. The checkpoint evaluates like a trained one (`cconv evaluate DIR`).
     """
-    from cconv.evaluation.metrics import frame_errors, normalized_mse
-    from cconv.study.problem import provenance
-    from cconv.study.stages import Ridge
-    from cconv.training.checkpoint import save_model
-    from cconv.training.closed_form import solve_closed_form
+    from cconv.models.checkpoint import save_model
+    from cconv.models.closed_form import solve_closed_form
+    from cconv.models.errors import frame_errors, normalized_mse
+    from cconv.study.declared.stage_tables import Ridge
+    from cconv.study.running.problem import provenance
 
     check_setting(Ridge, ridge, "--ridge")
     config, problem, dataset = _study_and_problem(study, data, settings, out)
@@ -120,8 +120,8 @@ def evaluate(
     their own, or given here; those of the checkpoint are only for the data that it was trained on.
     """
     from cconv.data.targets import iterate_samples
-    from cconv.study.problem import open_card_data
-    from cconv.training.checkpoint import load_model, read_card
+    from cconv.models.checkpoint import load_model, read_card
+    from cconv.study.running.problem import open_card_data
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
     given = {
@@ -197,9 +197,8 @@ def report(path: RunPath) -> None:
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report
-    from cconv.study.config import recorded_study
-    from cconv.study.records import RunFolder
-    from cconv.study.space import recorded_space
+    from cconv.study.records.recorded import recorded_space, recorded_study
+    from cconv.study.records.run_folder import RunFolder
 
     run = RunFolder.open(path)
     recorded_study(run), recorded_space(run)  # whose every key the page may show
@@ -219,8 +218,8 @@ def report(path: RunPath) -> None:
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
-    from cconv.study.config import load_study
-    from cconv.study.problem import load_problem, open_study_data, with_data_path
+    from cconv.study.declared.study_file import load_study
+    from cconv.study.running.problem import load_problem, open_study_data, with_data_path
 
     config = load_study(study, settings or [])
     if data is not None:

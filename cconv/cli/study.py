@@ -11,7 +11,7 @@ from cconv.cli.live import StudyDisplay
 from cconv.errors import CConvError
 
 if TYPE_CHECKING:
-    from cconv.study.records import RunFolder
+    from cconv.study.records.run_folder import RunFolder
 
 # Commands import what they run inside, as torch and ray take seconds to load and `--help` should not.
 
@@ -73,11 +73,11 @@ def run(
     what was recorded stays readable (`cconv study status`, `cconv report`), and `cconv study resume` goes on, also
     after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
-    from cconv.study.config import load_study
+    from cconv.study.declared.search_space import load_space
+    from cconv.study.declared.study_file import load_study
     from cconv.study.pipeline import begin_study
-    from cconv.study.problem import open_study_data, with_data_path
-    from cconv.study.records import RunFolder
-    from cconv.study.space import load_space
+    from cconv.study.records.run_folder import RunFolder
+    from cconv.study.running.problem import open_study_data, with_data_path
 
     config = load_study(study, settings or [])
     if data is not None:
@@ -102,7 +102,7 @@ def resume(path: RunPath, data: DataPath = None, address: Address = None, storag
     rungs of ASHA are those that they were.
     """
     from cconv.study.pipeline import move_data
-    from cconv.study.records import RunFolder
+    from cconv.study.records.run_folder import RunFolder
 
     folder = RunFolder.open(path)
     if data is not None:
@@ -120,7 +120,7 @@ def extend(
 ) -> None:
     """Give a search of a study more trials, and run the stages that read it again on what is trained already."""
     from cconv.study.pipeline import extend_study
-    from cconv.study.records import RunFolder
+    from cconv.study.records.run_folder import RunFolder
 
     folder = RunFolder.open(path)
     extend_study(folder, stage, trials)
@@ -157,7 +157,8 @@ def status(
     path: RunPath, as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False
 ) -> None:
     """Show how far a study has come: its state, its trials by outcome, the best so far."""
-    from cconv.study.records import RunFolder, count_outcomes
+    from cconv.study.records.run_folder import RunFolder
+    from cconv.study.records.trials import count_outcomes
 
     folder = RunFolder.open(path)
     records = folder.trials()

@@ -19,10 +19,10 @@ from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
 from cconv.evaluation.cost_model import Surroundings, estimate
 from cconv.evaluation.memory import peak_megabytes
+from cconv.models.model import FieldConfig, FieldModel
 from cconv.neighbors import radius_graph
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
-from cconv.training.field_model import FieldConfig, FieldModel
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
 

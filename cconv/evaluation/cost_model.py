@@ -93,7 +93,7 @@ def estimate(
     """Cost of one particle's prediction, its features given.
 
     Args:
-        network: All settings of `cconv.training.field_model.NetworkConfig`.
+        network: All settings of `cconv.models.model.NetworkConfig`.
         dim: Number of space dimensions D.
         vector_output: Whether the target is a vector.
         boundary_channels: Features of a boundary point, 0 where the scene has none; networks without `boundary` leave

@@ -19,10 +19,10 @@ from torch import Tensor
 from cconv.data.features import FluidState, Inputs, Units
 from cconv.data.targets import TASKS, VECTOR_TASKS, Sample
 from cconv.domain import Box
+from cconv.models.model import FieldModel
 from cconv.neighbors import radius_graph
 from cconv.nn.filters import window_values
 from cconv.sph.operators import density
-from cconv.training.field_model import FieldModel
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 _POINTS_ON_LINE, _RADII, _BINS_PER_DECADE = 161, 80, 5

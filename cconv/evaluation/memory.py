@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from cconv.data.trajectory import Frame, Scene
-from cconv.training.field_model import FieldModel
+from cconv.models.model import FieldModel
 
 Load = Callable[[Path], FieldModel]
 

@@ -1,88 +1,12 @@
 """Errors of a model on samples, and those of the trivial model that always predicts the mean."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from cconv.data.features import standardize_vectors
 from cconv.data.targets import Sample
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameError:
-    """Error of a model on one frame.
-
-    Attributes:
-        trajectory: Name of the frame's trajectory.
-        frame: Index of the frame in it.
-        num_particles: Fluid particles N.
-        normalized_mse: Mean squared error over particles and components / variance of the target over training.
-        per_frame_normalized_mse: The same, divided by the variance of this frame's own target (the thesis's measure);
-            None where that target is constant.
-    """
-
-    trajectory: str
-    frame: int
-    num_particles: int
-    normalized_mse: float
-    per_frame_normalized_mse: float | None
-
-
-@torch.no_grad()
-def frame_errors(model, samples: Iterable[Sample], geometry: Callable | None = None) -> list[FrameError]:
-    """Errors of a model on each frame.
-
-    Args:
-        model: A `FieldModel`.
-        samples: Frames with targets.
-        geometry: Sample to geometry, e.g. a cache; by default computed afresh.
-    """
-    geometry = geometry or (lambda sample: model.geometry(sample.inputs))
-    errors = []
-    for sample in samples:
-        target = model.standardize_target(sample.target)
-        errors.append(_frame_error(sample, model(sample.inputs, geometry(sample)), target))
-    return errors
-
-
-def mean_predictor_error(samples: Iterable[Sample], train_samples: Iterable[Sample]) -> list[FrameError]:
-    """Errors, on each frame, of predicting the mean of the training split everywhere.
-
-    By definition `normalized_mse` of them is 1 on the training split. On another split it is what a model must be below
-    to know anything: more than 1 where that split moves more than the training split, less where it is calmer.
-
-    Args:
-        samples: Frames of a split.
-        train_samples: Frames of the training split.
-    """
-    training = standardize_vectors(sample.target for sample in train_samples)
-    errors = []
-    for sample in samples:
-        target = (sample.target.double() - training.mean) / training.scale
-        errors.append(_frame_error(sample, torch.zeros_like(target), target))
-    return errors
-
-
-def _frame_error(sample: Sample, prediction: Tensor, target: Tensor) -> FrameError:
-    """Error of a standardised prediction of a standardised target, both (N, C)."""
-    squared = (prediction - target).double().square().mean().item()
-    own_variance = target.double().var(dim=0, correction=0).mean().item()
-    return FrameError(
-        trajectory=sample.trajectory,
-        frame=sample.frame,
-        num_particles=len(target),
-        normalized_mse=squared,
-        per_frame_normalized_mse=squared / own_variance if own_variance > 0 else None,
-    )
-
-
-def normalized_mse(errors: Sequence[FrameError]) -> float:
-    """Mean squared error over a split / variance of the target over the training split."""
-    weights = [error.num_particles for error in errors]
-    return float(np.average([error.normalized_mse for error in errors], weights=weights))
+from cconv.models.errors import FrameError, normalized_mse
 
 
 def own_variance(model, samples: Iterable[Sample]) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
 from cconv.evaluation.probes import Probe, Probes, Rollout
-from cconv.training.field_model import FieldModel
+from cconv.models.model import FieldModel
 
 NOT_FINITE = 1e9  # stands for an error that is infinite or no number, so that files can hold it
 PRECISE_STATES = ("as_it_is", "far_away")  # states in which float32 is compared with float64

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cconv.errors import DataError
 from cconv.report.colors import MARKED
 from cconv.report.plots import new_figure
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 Explanation = Mapping[str, np.ndarray]
 _SYMBOLS = {"density_rate": "Dρ/Dt", "density_gradient": "∇ρ"}

@@ -16,7 +16,8 @@ def importance_chart(entries: Sequence[Mapping], title: str = "importance of hyp
     """Shares of the variance with intervals, found or not, and beside them two estimates without: a row a rung.
 
     Args:
-        entries: Of `cconv.study.importance.importance_by_rung`, one or more with importances; the others are left out.
+        entries: Of `cconv.study.evidence.importance.importance_by_rung`, one or more with importances; the others are
+            left out.
         title: Title of the figure.
     """
     entries = [entry for entry in entries if entry["parameters"]]
@@ -43,7 +44,7 @@ def partial_dependence_chart(dependences: Sequence[Mapping], columns: int = 3) -
     How far the trees differ is no confidence interval, and the legend says what is drawn.
 
     Args:
-        dependences: Of `cconv.study.partial_dependence.partial_dependence`, most important first.
+        dependences: Of `cconv.study.evidence.partial_dependence.partial_dependence`, most important first.
         columns: Panels in a row.
     """
     rows = math.ceil(len(dependences) / columns)

@@ -25,7 +25,7 @@ from cconv.report.plots import (
 )
 from cconv.report.tables import MEAN_PREDICTOR, curves_table, finalists_table, importance_table, trials_table
 from cconv.report.verdicts import verdict_matrix
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 # Figures of what a summary may hold, by the key that it holds it under.
 _CHARTS: dict[str, Callable[[Mapping], Figure]] = {

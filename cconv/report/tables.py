@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 ANALYTIC = "analytic SPH"
 MEAN_PREDICTOR = "predicting the mean"  # of the training split, always and everywhere

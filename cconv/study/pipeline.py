@@ -7,27 +7,29 @@ from contextlib import ExitStack, contextmanager
 
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
-from cconv.evaluation.metrics import mean_predictor_error, normalized_mse
-from cconv.study.ablation import ablate
-from cconv.study.baseline import train_baseline
-from cconv.study.closed_form import screen_closed_forms
-from cconv.study.config import StudyConfig, recorded_study
-from cconv.study.convergence import train_longer
-from cconv.study.costs import CostCounter
-from cconv.study.environment import describe_environment
-from cconv.study.finalists import retrain_finalists
-from cconv.study.initialization import train_unstopped
-from cconv.study.observer import Observer
-from cconv.study.optuna_mirror import database_answers, open_mirror
-from cconv.study.problem import load_problem, open_study_data, with_data_path
-from cconv.study.ray_pool import ray_pool, remove_left_behind
-from cconv.study.reading_stages import measure_importance, refine_space
-from cconv.study.records import FORMAT, RunFolder
-from cconv.study.search import adaptive_search, random_search, spend_otherwise
-from cconv.study.select import select
-from cconv.study.session import Progress, Session
-from cconv.study.space import SearchSpace, check_baseline_affordable, fixed, recorded_space
-from cconv.study.stages import Trials, readers_of
+from cconv.models.errors import mean_predictor_error, normalized_mse
+from cconv.study.declared.domains import SearchSpace, fixed
+from cconv.study.declared.search_space import check_baseline_affordable
+from cconv.study.declared.stage_tables import Trials, readers_of
+from cconv.study.declared.study_file import StudyConfig
+from cconv.study.records.environment import describe_environment
+from cconv.study.records.recorded import recorded_space, recorded_study
+from cconv.study.records.run_folder import FORMAT, RunFolder
+from cconv.study.running.counted_costs import CostCounter
+from cconv.study.running.observer import Observer
+from cconv.study.running.optuna_mirror import database_answers, open_mirror
+from cconv.study.running.problem import load_problem, open_study_data, with_data_path
+from cconv.study.running.ray_pool import ray_pool, remove_left_behind
+from cconv.study.stages.ablation import ablate
+from cconv.study.stages.analysis_stages import measure_importance, refine_space
+from cconv.study.stages.baseline import train_baseline
+from cconv.study.stages.closed_form import screen_closed_forms
+from cconv.study.stages.converge import train_longer
+from cconv.study.stages.finalists import retrain_finalists
+from cconv.study.stages.initialization import train_unstopped
+from cconv.study.stages.search import adaptive_search, random_search, spend_otherwise
+from cconv.study.stages.select import select
+from cconv.study.stages.session import Progress, Session
 from cconv.validation import check_setting
 
 RAY_FILES = "ray"  # folder in that of the run

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from cconv.data.targets import Sample
-from cconv.training.field_model import FieldGeometry
+from cconv.models.model import FieldGeometry
 
 
 class GeometryCache:

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 
 from cconv.data.targets import Sample
 from cconv.errors import check_choice
-from cconv.evaluation.metrics import frame_errors, normalized_mse
+from cconv.models.errors import frame_errors, normalized_mse
+from cconv.models.model import FieldModel
 from cconv.training.batches import batches
-from cconv.training.field_model import FieldModel
 from cconv.training.geometry_cache import GeometryCache
 from cconv.training.progress import Progress, begin
 

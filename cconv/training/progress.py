@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from cconv.errors import DataError
 from cconv.files import parse_json
-from cconv.training.field_model import FieldModel
+from cconv.models.model import FieldModel
 from cconv.validation import Real, StrictModel, Whole
 
 

@@ -33,11 +33,11 @@ from torch import Tensor, nn
 
 from cconv import open_dataset, radius_graph
 from cconv.data.targets import make_sample
+from cconv.models.model import NetworkConfig, build_field_model
 from cconv.neighbors import Edges
 from cconv.nn import ConvGeometry, continuous_conv
 from cconv.ops import general
 from cconv.sph import CubicSpline
-from cconv.training.field_model import NetworkConfig, build_field_model
 
 HAS_OPEN3D = find_spec("open3d") is not None
 QUANTITIES = ("forward", "forward + backward")

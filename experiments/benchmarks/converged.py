@@ -18,15 +18,16 @@ import torch
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from cconv.evaluation.metrics import frame_errors, mean_predictor_error, normalized_mse
+from cconv.files import write_json
+from cconv.models.checkpoint import load_model
+from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.report.plots import budget_chart
-from cconv.study.config import StudyConfig, load_study
-from cconv.study.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
-from cconv.study.records import TrialFolder, write_json
-from cconv.study.space import load_space
-from cconv.study.stages import BASELINE
-from cconv.study.trial import run_trial
-from cconv.training.checkpoint import load_model
+from cconv.study.declared.search_space import load_space
+from cconv.study.declared.stage_tables import BASELINE
+from cconv.study.declared.study_file import StudyConfig, load_study
+from cconv.study.records.trials import TrialFolder
+from cconv.study.running.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
+from cconv.study.running.trial import run_trial
 
 STUDY = Path(__file__).parents[1] / "dpi_converged.toml"
 RESULTS = Path(__file__).parent / "results" / "converged"

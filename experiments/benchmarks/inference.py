@@ -28,9 +28,9 @@ from cconv import open_dataset, radius_graph
 from cconv.data.targets import Sample, make_sample
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
+from cconv.models.checkpoint import load_model, save_model
+from cconv.models.model import FieldModel, NetworkConfig, build_field_model
 from cconv.sph import CubicSpline
-from cconv.training.checkpoint import load_model, save_model
-from cconv.training.field_model import FieldModel, NetworkConfig, build_field_model
 
 SPACING = 0.05
 DIM = 3

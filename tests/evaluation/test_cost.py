@@ -13,10 +13,10 @@ from cconv.evaluation.cost import (
     measure_costs,
     measure_growth,
 )
+from cconv.models.checkpoint import load_model, save_model
+from cconv.models.model import FieldConfig, NetworkConfig
 from cconv.neighbors import radius_graph
 from cconv.sph import CubicSpline
-from cconv.training.checkpoint import load_model, save_model
-from cconv.training.field_model import FieldConfig, NetworkConfig
 
 
 def test_flops_of_one_layer_counted_by_hand(generator):
@@ -82,7 +82,7 @@ def test_the_sum_of_densities_is_timed_where_a_model_needs_it(generator, monkeyp
     """What is timed is the prediction from a stored frame, so the density is summed once for the model with density."""
     given, sums = problem(generator), []
     monkeypatch.setattr(
-        "cconv.training.field_model.fluid_state", lambda *arguments: (sums.append(1), fluid_state(*arguments))[1]
+        "cconv.models.model.fluid_state", lambda *arguments: (sums.append(1), fluid_state(*arguments))[1]
     )
     for density in (False, True):
         model = given.build_model(NetworkConfig(layers=1, kernel_size=3, density=density), 0)

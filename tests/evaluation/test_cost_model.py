@@ -8,8 +8,8 @@ from systems import kernel, periodic_frame, periodic_scene, with_walls
 from cconv.data.targets import make_sample
 from cconv.evaluation.cost import flops_per_particle, surroundings_of
 from cconv.evaluation.cost_model import Surroundings, ball_volume, estimate
+from cconv.models.model import NetworkConfig, build_field_model
 from cconv.nn import ContinuousConv
-from cconv.training.field_model import NetworkConfig, build_field_model
 
 SEVERAL = {"layers": 3, "first_channels": 5, "hidden_channels": 7}
 GRID = [

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from cconv.evaluation.statistics import FEWEST, crossed_interval, mean_interval, paired_ratio, why_no_interval
-from cconv.study.effects import effects
-from cconv.study.front import hypervolume, hypervolume_interval
-from cconv.study.rung_audit import FEWEST_FOR_INTERVAL, rung_measures, spearman_interval
-from cconv.study.variance import FEWEST_VALUES, compare_variances
+from cconv.study.evidence.effects import effects
+from cconv.study.evidence.front import hypervolume, hypervolume_interval
+from cconv.study.evidence.rung_audit import FEWEST_FOR_INTERVAL, rung_measures, spearman_interval
+from cconv.study.evidence.seed_variance import FEWEST_VALUES, compare_variances
 
 SPREADS = [(0.1, 0.3, 0.1), (0.3, 0.5, 0.3), (0.5, 1.0, 0.3)]  # of seed, unit and both
 SHAPES = [(1, 4), (1, 5), (1, 12), (4, 4), (5, 4), (5, 5), (5, 12), (8, 6)]

@@ -9,8 +9,8 @@ from systems import kernel, periodic_frame, periodic_scene
 
 from cconv.data.targets import make_sample
 from cconv.evaluation.explanation import error_distribution, explain, first_layer_filters
-from cconv.training.closed_form import solve_closed_form
-from cconv.training.field_model import NetworkConfig, build_field_model
+from cconv.models.closed_form import solve_closed_form
+from cconv.models.model import NetworkConfig, build_field_model
 
 SIDE = 12
 RADIAL = NetworkConfig(layers=1, basis="radial", message="difference", relative_cutoff=2.0)
@@ -141,7 +141,7 @@ def test_fields_are_those_of_the_model_and_files_need_no_pickle(generator, tmp_p
 
 
 def test_mean_squared_particle_error_is_the_normalized_mse(generator):
-    from cconv.evaluation.metrics import frame_errors
+    from cconv.models.errors import frame_errors
 
     (sample,) = samples_of(generator, "density_gradient", 1)
     model = built(GRID, [sample], "density_gradient")

@@ -6,16 +6,9 @@ import pytest
 import torch
 from systems import problem
 
-from cconv.evaluation.metrics import (
-    FrameError,
-    blocks_of_errors,
-    frame_errors,
-    mean_predictor_error,
-    normalized_mse,
-    own_variance,
-    per_frame_normalized_mse,
-)
-from cconv.training.field_model import NetworkConfig
+from cconv.evaluation.metrics import blocks_of_errors, own_variance, per_frame_normalized_mse
+from cconv.models.errors import FrameError, frame_errors, mean_predictor_error, normalized_mse
+from cconv.models.model import NetworkConfig
 
 
 def error(value, trajectory="0", frame=0, particles=10):

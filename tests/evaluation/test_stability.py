@@ -22,10 +22,10 @@ from cconv.evaluation.stability import (
     regime_errors,
     stressed_error,
 )
+from cconv.models.closed_form import solve_closed_form
+from cconv.models.model import NetworkConfig, build_field_model
 from cconv.neighbors import radius_graph
 from cconv.sph import CubicSpline
-from cconv.training.closed_form import solve_closed_form
-from cconv.training.field_model import NetworkConfig, build_field_model
 
 NETWORK = NetworkConfig(layers=1, basis="radial", message="difference", relative_cutoff=2.0)
 TASKS = ("density_rate", "density_gradient")

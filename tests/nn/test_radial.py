@@ -5,7 +5,8 @@ import torch
 
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
-from cconv.nn import RadialConv, RadialGeometry, RadialNet
+from cconv.networks import RadialNet
+from cconv.nn import RadialConv, RadialGeometry
 from cconv.nn.radial_conv import join_kinds, num_values, split_kinds
 from cconv.sph import CubicSpline, density_gradient, density_rate
 

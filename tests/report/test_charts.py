@@ -25,7 +25,7 @@ from cconv.report.plots import (
 )
 from cconv.report.speed_accuracy import error_range, speed_accuracy_chart, spread
 from cconv.report.tables import ANALYTIC, curves_table, speed_accuracy_table, trials_table
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 

@@ -12,7 +12,7 @@ from summaries import whole_summary
 from cconv.errors import DataError
 from cconv.report.fields import read_explanations
 from cconv.report.page import render_report
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 HOSTILE = "</script></style><img src=x onerror=evil()><script>evil()</script>\"'&"

@@ -11,7 +11,7 @@ from summaries import explanation, whole_summary
 
 from cconv.report import page
 from cconv.report.page import render_report, write_report
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 OPTIONAL = (

@@ -21,7 +21,7 @@ from cconv.report.tables import (
     trials_table,
 )
 from cconv.report.verdicts import failures_table, verdict_matrix, verdicts_table
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 

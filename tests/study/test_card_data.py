@@ -6,7 +6,7 @@ import pytest
 from particle_files import record_frames, write_parts
 
 from cconv.errors import ConfigError
-from cconv.study.problem import open_card_data
+from cconv.study.running.problem import open_card_data
 
 
 @pytest.fixture

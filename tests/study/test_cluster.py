@@ -17,8 +17,8 @@ from outcomes import assert_one_clear_line
 from processes import PATIENCE, kill_tree, names
 from studies import write_search
 
-from cconv.study.optuna_mirror import open_storage
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.running.optuna_mirror import open_storage
 
 
 @pytest.fixture

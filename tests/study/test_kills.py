@@ -23,7 +23,7 @@ from conftest import SCRIPT
 from processes import PATIENCE, kill_tree
 from studies import write_search
 
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 KILLS = int(os.environ.get("CCONV_KILLS", "50"))
 ENDS_BY_ITSELF = 120  # seconds within which what a killed process started notices it; agents of Ray need 60

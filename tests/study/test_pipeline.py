@@ -11,10 +11,11 @@ from processes import PATIENCE
 
 from cconv import load_model, open_dataset
 from cconv.data.targets import iterate_samples
-from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.study.optuna_mirror import open_storage
-from cconv.study.records import RunFolder
-from cconv.study.space import SearchSpace, fixed, load_space
+from cconv.models.errors import frame_errors, normalized_mse
+from cconv.study.declared.domains import SearchSpace, fixed
+from cconv.study.declared.search_space import load_space
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.running.optuna_mirror import open_storage
 
 
 @pytest.fixture

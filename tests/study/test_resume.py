@@ -10,7 +10,7 @@ from outcomes import assert_one_clear_line
 from processes import PATIENCE, kill_tree
 from studies import write_search
 
-from cconv.study.records import RunFolder
+from cconv.study.records.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 from systems import problem
 
-from cconv.training.field_model import NetworkConfig
+from cconv.models.model import NetworkConfig
 from cconv.training.geometry_cache import GeometryCache
 
 

@@ -5,8 +5,8 @@ import torch
 from systems import problem
 
 from cconv.errors import ConfigError
-from cconv.evaluation.metrics import frame_errors, normalized_mse
-from cconv.training.field_model import NetworkConfig
+from cconv.models.errors import frame_errors, normalized_mse
+from cconv.models.model import NetworkConfig
 from cconv.training.loop import SCHEDULES, train
 
 LINEAR = NetworkConfig(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")

@@ -9,8 +9,8 @@ from systems import kernel, periodic_frame, periodic_scene, with_walls
 
 from cconv.data.targets import make_sample
 from cconv.data.trajectory import Boundary
-from cconv.training.closed_form import solve_closed_form
-from cconv.training.field_model import NetworkConfig, build_field_model
+from cconv.models.closed_form import solve_closed_form
+from cconv.models.model import NetworkConfig, build_field_model
 
 KINDS = [
     {"basis": basis, "message": message, "layers": layers, "boundary": boundary, "density": density}
@@ -63,7 +63,7 @@ def test_every_parameter_gets_a_gradient(kind, task, generator):
 @pytest.mark.parametrize("density", [True, False])
 def test_no_two_coefficients_of_a_layer_of_differences_do_the_same(basis, task, density, generator):
     """The layer as a linear map of its coefficients has full rank."""
-    from cconv.nn.closed_form import linear_layer
+    from cconv.networks.linear_terms import linear_layer
 
     kind = {"basis": basis, "message": "difference", "layers": 1, "boundary": True, "density": density}
     rows = []
@@ -109,7 +109,7 @@ def test_differences_predict_the_same_rate_in_every_frame_of_reference(kind, gen
 
 
 def test_the_published_network_keeps_its_parameters():
-    from cconv.training.field_model import FieldConfig, _grid_network
+    from cconv.models.model import FieldConfig, _grid_network
 
     config = FieldConfig(
         task="density_gradient",

@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 from systems import problem
 
 from cconv.errors import DataError
-from cconv.training.field_model import NetworkConfig
+from cconv.models.model import NetworkConfig
 from cconv.training.loop import train
 from cconv.training.progress import begin, load_progress, save_progress
 

@@ -11,9 +11,9 @@ from cconv.data.targets import make_sample
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
 from cconv.errors import ConfigError
+from cconv.models.closed_form import solve_closed_form
+from cconv.models.model import NetworkConfig, build_field_model
 from cconv.sph import CubicSpline
-from cconv.training.closed_form import solve_closed_form
-from cconv.training.field_model import NetworkConfig, build_field_model
 
 TASKS = ("density_rate", "density_gradient")
 NETWORKS = [

@@ -1,0 +1,78 @@
+"""Search spaces: which hyperparameters vary, over what, when, and why. TOML, validated; see search_spaces/README.md."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from cconv.errors import ConfigError, did_you_mean, shown
+from cconv.evaluation.cost_model import Estimate
+from cconv.files import read_toml
+from cconv.models.model import NetworkConfig
+from cconv.study.declared.domains import SearchSpace, Value
+from cconv.study.declared.study_file import HYPERPARAMETERS, StudyConfig, TrainingConfig, configure
+from cconv.validation import validated
+
+
+def load_space(path: Path | str, study: StudyConfig | None = None) -> SearchSpace:
+    """Search space from a TOML file.
+
+    Args:
+        path: The file.
+        study: The study whose settings the space varies; the defaults if None.
+
+    Raises:
+        ConfigError: If the file cannot be read, names no hyperparameter of ours, or a value, condition or the baseline
+            is impossible.
+    """
+    space = validated(SearchSpace, read_toml(path), path)
+    check_possible(space, path, study)
+    return space
+
+
+def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | None = None) -> None:
+    """Check that every parameter is a hyperparameter, and that its values and the baseline are possible.
+
+    Args:
+        space: The search space.
+        source: Where it comes from, for the message.
+        study: The study whose settings the space varies; the defaults if None.
+
+    Raises:
+        ConfigError: With the parameter and the value.
+    """
+    settings = (study.network, study.training) if study else (NetworkConfig(), TrainingConfig())
+    for name, parameter in space.parameters.items():
+        if name not in HYPERPARAMETERS:
+            raise ConfigError(
+                f"{source}: unknown hyperparameter `parameters.{name}`.{did_you_mean(name, HYPERPARAMETERS)} "
+                f"Known: {', '.join(HYPERPARAMETERS)}."
+            )
+        for value in parameter.extremes:
+            values = space.making_active(name) | {name: value}
+            _check_configures(values, settings, f"{source}: `parameters.{name}`: the value {shown(value)}")
+    _check_configures(space.baseline, settings, f"{source}: the baseline")
+
+
+def _check_configures(parameters: Mapping[str, Value], settings: tuple, what: str) -> None:
+    try:
+        configure(parameters, *settings)
+    except ConfigError as error:
+        raise ConfigError(f"{what} is {error}.") from error
+
+
+def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str, Value]], Estimate]) -> None:
+    """Refuse a space whose own baseline costs more than its caps, once the scene is known.
+
+    Args:
+        space: The search space.
+        cost_of: Cost of one particle's prediction by a configuration.
+
+    Raises:
+        ConfigError: If the baseline is above a cap.
+    """
+    for name, cap in space.caps.items():
+        cost = getattr(cost_of(space.baseline), name)
+        if cost > cap:
+            raise ConfigError(
+                f"search space {space.name!r}: its baseline costs {cost:.3g} {name.replace('_', ' ')} in this scene, "
+                f"above `max_{name}` = {cap:.3g}; raise the cap or take a cheaper baseline."
+            )

@@ -1,0 +1,271 @@
+"""Study files: what to learn, from which data, how to search. TOML, validated."""
+
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from cconv.errors import LONGEST_SHOWN, ConfigError, did_you_mean, shown, visible
+from cconv.files import DEEPEST, parse_toml, read_toml
+from cconv.models.model import NetworkConfig
+from cconv.sph.kernels import KERNELS
+from cconv.study.declared.stage_tables import Stage, check_names, check_order, default_stages, included
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole, validated
+
+MOST_UPDATES = 10**9
+Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
+_Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
+_Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
+_Share = Annotated[Real, Field(ge=1e-6, le=1e6)]
+
+
+def rungs_up_to(full_updates: int, grace_updates: int, reduction_factor: int) -> list[int]:
+    """Updates of the rungs: ``grace_updates · reduction_factor^k`` below the full budget, then the full budget."""
+    rungs = []
+    while grace_updates < full_updates:
+        rungs.append(grace_updates)
+        grace_updates *= reduction_factor
+    return [*rungs, full_updates]
+
+
+class DataConfig(StrictModel):
+    """Particle data and targets. Lengths and times in the units of the data; None takes what the data say."""
+
+    path: PathText | None = None
+    particle_spacing: Length | None = None
+    mass: Length | None = None
+    frame_dt: Length | None = None
+    force: tuple[_Component, ...] | None = Field(None, min_length=1, max_length=3)
+    kernel: str = "cubic_spline"
+    smoothing_length: Length | None = None
+    split_fractions: tuple[_Share, _Share, _Share] = (0.7, 0.15, 0.15)
+    gap: Whole = Field(2, ge=0, le=10**6)
+
+    @field_validator("kernel")
+    @classmethod
+    def _known_kernel(cls, name: str) -> str:
+        if name not in KERNELS:
+            raise ValueError(f"must be one of {', '.join(KERNELS)}")
+        return name
+
+
+class TrainingConfig(StrictModel):
+    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache."""
+
+    updates: Updates = 600
+    evaluate_every: Updates = 50
+    batch_size: Whole = Field(1, ge=1, le=10**6)
+    learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
+    schedule: Literal["constant", "cosine", "exponential"] = "cosine"
+    cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
+
+
+class SearchConfig(StrictModel):
+    """What random and adaptive searches share: the space, ASHA's rungs, limits of a trial.
+
+    A trial whose validation error exceeds `give_up_above` at an evaluation is stopped. One that has trained for
+    `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency` None means as many
+    trials at once as cores.
+    """
+
+    space: PathText
+    grace_updates: Updates = 50
+    reduction_factor: Whole = Field(3, ge=2, le=1000)
+    give_up_above: Real = Field(10.0, ge=1e-12, le=1e9)
+    trial_seconds: Real = Field(3600.0, ge=1e-3, le=1e7)
+    concurrency: Whole | None = Field(None, ge=1, le=4096)
+
+
+class FinalistsConfig(StrictModel):
+    """Protocol of every retraining and test. `updates` None means the search's budget."""
+
+    seeds: Whole = Field(5, ge=2, le=1000)
+    updates: Updates | None = None
+    frames_per_block: Whole = Field(3, ge=1, le=10**6)
+
+
+class SelectionConfig(StrictModel):
+    """When accurate is accurate enough.
+
+    Models below `accurate_enough` count as equal, and the cheapest wins; `margin` is how much worse than the best a
+    model may be, as a share of the best error, to count as not inferior.
+    """
+
+    accurate_enough: Real | None = Field(None, ge=1e-15, le=1e6)
+    margin: Real = Field(0.05, ge=1e-9, le=100)
+
+
+class CostConfig(StrictModel):
+    """Isolated timing of the finalists; of `trials` further models for the check of the cost model; growth with N."""
+
+    threads: Whole = Field(1, ge=1, le=1024)
+    repeats: Whole = Field(20, ge=3, le=10_000)
+    trials: Whole = Field(6, ge=0, le=10_000)
+    sizes: tuple[_Size, ...] = Field((1000, 3000, 10_000, 30_000, 100_000), min_length=1, max_length=20)
+
+    @field_validator("sizes")
+    @classmethod
+    def _ascending(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
+        if not all(low < high for low, high in pairwise(sizes)):
+            raise ValueError("sizes must ascend, each one once")
+        return sizes
+
+
+class SeedsConfig(StrictModel):
+    """Three seeds, never one: split and batch order, initial weights, sampling of configurations."""
+
+    data: Seed = 0
+    init: Seed = 0
+    search: Seed = 0
+
+
+class StudyConfig(StrictModel):
+    """A whole study."""
+
+    name: Name
+    task: Literal["density_rate", "density_gradient"]
+    data: DataConfig = DataConfig()
+    network: NetworkConfig = NetworkConfig()
+    training: TrainingConfig = TrainingConfig()
+    search: SearchConfig
+    finalists: FinalistsConfig = FinalistsConfig()
+    cost: CostConfig = CostConfig()
+    selection: SelectionConfig = SelectionConfig()
+    seeds: SeedsConfig = SeedsConfig()
+    stages: dict[Name, Stage] = Field(default_factory=default_stages, min_length=1, max_length=100)
+
+    @field_validator("stages", mode="before")
+    @classmethod
+    def _kinds_from_names(cls, stages: object) -> object:
+        if not isinstance(stages, Mapping):
+            return stages
+        return {name: {"kind": name} | stage if isinstance(stage, dict) else stage for name, stage in stages.items()}
+
+    @field_validator("stages")
+    @classmethod
+    def _stages_read_earlier_ones(cls, stages: dict[str, Stage]) -> dict[str, Stage]:
+        check_names(stages)
+        check_order(stages)
+        return stages
+
+    @model_validator(mode="after")
+    def _budgets_fit(self) -> "StudyConfig":
+        search, training = self.search, self.training
+        if search.grace_updates > training.updates:
+            raise ValueError(
+                f"search.grace_updates ({search.grace_updates}) must not exceed training.updates ({training.updates}), "
+                "or no rung would be reached"
+            )
+        if search.grace_updates % training.evaluate_every:
+            raise ValueError(
+                f"search.grace_updates ({search.grace_updates}) must be a multiple of "
+                f"training.evaluate_every ({training.evaluate_every}), or no rung would be evaluated"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _included_are_possible(self) -> "StudyConfig":
+        for finalist, parameters in included(self.stages):
+            try:
+                check_known(parameters)
+                configure(parameters, self.network, self.training)
+            except ConfigError as error:
+                raise ValueError(f"finalist `{finalist}`: {error}") from error
+        return self
+
+    @property
+    def rungs(self) -> list[int]:
+        """Updates of ASHA's rungs, the full budget last."""
+        return rungs_up_to(self.training.updates, self.search.grace_updates, self.search.reduction_factor)
+
+    @property
+    def concurrency(self) -> int:
+        """Trials at once: as many as cores, unless set."""
+        return self.search.concurrency or os.cpu_count() or 1
+
+
+TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
+HYPERPARAMETERS = (*NetworkConfig.model_fields, *TRAINING_HYPERPARAMETERS)
+
+
+def check_known(parameters: Mapping[str, Value]) -> None:
+    """Raise `ConfigError` unless all names are those of hyperparameters."""
+    for name in parameters:
+        if name not in HYPERPARAMETERS:
+            raise ConfigError(
+                f"unknown hyperparameter {shown(name)}.{did_you_mean(name, HYPERPARAMETERS)} "
+                f"Known: {', '.join(HYPERPARAMETERS)}."
+            )
+
+
+def configure(
+    parameters: Mapping[str, Value], network: NetworkConfig, training: TrainingConfig
+) -> tuple[NetworkConfig, TrainingConfig]:
+    """Network and training settings with the drawn hyperparameters in place of the study's own.
+
+    Raises:
+        ConfigError: If they are not possible together.
+    """
+    drawn = {name: value for name, value in parameters.items() if name in TRAINING_HYPERPARAMETERS}
+    shape = {name: value for name, value in parameters.items() if name not in TRAINING_HYPERPARAMETERS}
+    try:
+        return (
+            NetworkConfig.model_validate(network.model_dump() | shape),
+            TrainingConfig.model_validate(training.model_dump() | drawn),
+        )
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"])) or "together"
+        raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
+
+
+def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
+    """Study from a TOML file; its search space is looked for beside the file, then in the working folder.
+
+    Args:
+        path: The study file.
+        overrides: Settings that replace the file's, as ``"training.updates=100"``; values in TOML or plain text.
+
+    Raises:
+        ConfigError: If the file cannot be read or a key or value does not fit.
+    """
+    path = Path(path)
+    values = read_toml(path)
+    for override in overrides:
+        _apply(values, override)
+    study = validated(StudyConfig, values, path)
+    space = path.parent / study.search.space
+    if space.is_file():
+        study = study.model_copy(update={"search": study.search.model_copy(update={"space": str(space)})})
+    return study
+
+
+def _apply(values: dict, override: str) -> None:
+    name, equals, text = override.partition("=")
+    setting = f"--set {visible(override)[:LONGEST_SHOWN]}"
+    if not equals:
+        raise ConfigError(f"{setting}: must read key=value, e.g. training.updates=100.")
+    if name.count(".") >= DEEPEST:
+        raise ConfigError(f"{setting}: a key of more than {DEEPEST} parts; see the study file for its keys.")
+    *tables, key = name.strip().split(".")
+    for table in tables:
+        values = values.setdefault(table, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"{setting}: `{table}` is not a table; see the study file for its keys.")
+    values[key] = _value(text, setting)
+
+
+def _value(text: str, setting: str) -> object:
+    """A value in TOML, or else the text itself."""
+    if "\n" in text:
+        raise ConfigError(f"{setting}: must be one line.")
+    try:
+        return parse_toml(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    except ValueError as error:
+        raise ConfigError(f"{setting}: no value for a setting ({error}).") from error

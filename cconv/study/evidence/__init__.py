@@ -1,0 +1,1 @@
+"""Statistics over records; nothing here trains, and nothing loads torch or Ray."""

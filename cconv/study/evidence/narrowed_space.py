@@ -1,0 +1,199 @@
+"""Refinement: a narrower space from the records of earlier stages, and the evidence for every change.
+
+A value of a choice, or what lies beyond an end of a range, goes only if at most a tenth of the best trials use it and
+chance alone would hardly have let so few through: without influence, the number of the best trials that use it is
+hypergeometric. The baseline and the best trial always stay in.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+
+import tomli_w
+from scipy.stats import hypergeom
+
+from cconv.files import write_text
+from cconv.study.declared.domains import Choice, FloatRange, IntRange, Parameter, SearchSpace, Value, narrowed
+from cconv.study.records.trials import TrialRecord
+
+MIN_TRIALS = 20
+TOP_SHARE = 0.25
+SPARED_SHARE = 0.1  # of the best trials, as many may use what is given up
+SIGNIFICANCE = 0.01  # chance to give up what has no influence
+MARGIN = 0.1  # of the range, beyond the best trials
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Trials in which a parameter is active.
+
+    Attributes:
+        values: Value of each trial.
+        top: Value of each of the best, the very best first.
+        where: At which budget they were compared, in words.
+    """
+
+    values: list[Value]
+    top: list[Value]
+    where: str
+
+    @property
+    def spared(self) -> int:
+        """How many of the best may use what is given up."""
+        return int(SPARED_SHARE * len(self.top))
+
+    def is_unwanted(self, condition: Callable[[Value], bool]) -> bool:
+        """Whether the best hardly ever have such a value, though it was drawn often."""
+        drawn, used = (sum(map(condition, values)) for values in (self.values, self.top))
+        chance = hypergeom.cdf(used, len(self.values), drawn, len(self.top))
+        return used <= self.spared and bool(chance <= SIGNIFICANCE)
+
+    def use_of(self, value: Value) -> str:
+        """How often a value was drawn, in words."""
+        return f"{value!r} ({self.top.count(value)} of the best, {self.values.count(value)} of all)"
+
+    def __str__(self) -> str:
+        return f"the best {len(self.top)} of {len(self.values)} trials {self.where}"
+
+
+def refine(space: SearchSpace, records: Sequence[TrialRecord], full_updates: int) -> tuple[SearchSpace, dict[str, str]]:
+    """The space without what the best trials leave unused, and a reason for each of its parameters.
+
+    The best are a quarter of all trials, compared at the largest budget that so many reached; none are judged by fewer
+    than `MIN_TRIALS`. A conditional parameter is judged by the trials in which it is active. Several trainings of one
+    configuration count once.
+
+    Args:
+        space: The space that the trials were drawn from.
+        records: Trials of earlier stages; closed forms, failed and interrupted trials are left out.
+        full_updates: Budget of a trial that was never stopped.
+
+    Returns:
+        The refined space, and what became of each parameter of the old one, in words.
+    """
+    trained = _distinct([record for record in records if _counts(record)])
+    domains, reasons = {}, {}
+    for name, parameter in space.parameters.items():
+        domains[name], reasons[name] = _refined(name, parameter, trained, full_updates)
+    refined = narrowed(space, domains)
+    for name in space.parameters.keys() - refined.parameters.keys():
+        reasons[name] = f"left out: nothing that is left of {' and '.join(space.parameters[name].when)} makes it active"
+    parameters = {
+        name: parameter.model_copy(
+            update={"reason": f"{parameter.reason} {reasons[name][0].upper()}{reasons[name][1:]}."}
+        )
+        for name, parameter in refined.parameters.items()
+    }
+    update = {
+        "name": f"{space.name}_refined",
+        "description": f"{space.description} Narrowed by the records of {len(trained)} trials.",
+        "parameters": parameters,
+    }
+    return refined.model_copy(update=update), {name: reasons[name] for name in space.parameters}
+
+
+def write_space(space: SearchSpace, path: Path | str) -> None:
+    """Write a space as a TOML file that `load_space` reads back."""
+    write_text(Path(path), tomli_w.dumps(space.model_dump(mode="json", exclude_defaults=True)))
+
+
+def _explained(parameter: Parameter, reason: str) -> Parameter:
+    return parameter.model_copy(update={"reason": f"{parameter.reason} {reason[0].upper()}{reason[1:]}."})
+
+
+def _counts(record: TrialRecord) -> bool:
+    return not record.is_closed_form and record.outcome not in ("failed", "interrupted")
+
+
+def _distinct(records: Sequence[TrialRecord]) -> list[TrialRecord]:
+    """The first training of each configuration."""
+    first: dict[str, TrialRecord] = {}
+    for record in records:
+        first.setdefault(repr(sorted(record.parameters.items())), record)
+    return list(first.values())
+
+
+def _refined(
+    name: str, parameter: Parameter, records: Sequence[TrialRecord], full_updates: int
+) -> tuple[Parameter, str]:
+    active = [record for record in records if name in record.parameters and parameter.holds(record.parameters[name])]
+    evidence = _evidence(name, active, full_updates)
+    if evidence is None:
+        return parameter, f"kept: too few trials, {len(active)} of the {MIN_TRIALS} that it takes"
+    narrow = _narrow_choice if isinstance(parameter, Choice) else _narrow_range
+    return narrow(parameter, evidence)
+
+
+def _evidence(name: str, records: Sequence[TrialRecord], full_updates: int) -> _Evidence | None:
+    """The best quarter of all at the largest budget that so many reached; None if there are too few trials."""
+    values = [record.parameters[name] for record in records]
+    trials = list(zip(map(_errors_by_updates, records), values, strict=True))
+    count = math.ceil(TOP_SHARE * max(len(trials), MIN_TRIALS))
+    for updates in sorted({updates for errors, _ in trials for updates in errors}, reverse=True):
+        reached = sorted(((errors[updates], value) for errors, value in trials if updates in errors), key=itemgetter(0))
+        if len(trials) >= MIN_TRIALS and len(reached) >= count:
+            where = f"({len(reached)} compared at {updates} of {full_updates} updates)"
+            return _Evidence(values, [value for _, value in reached[:count]], where)
+    return None
+
+
+def _errors_by_updates(record: TrialRecord) -> Mapping[int, float]:
+    return {
+        entry["updates"]: entry["valid_normalized_mse"]
+        for entry in record.log
+        if entry["valid_normalized_mse"] is not None
+    }
+
+
+def _narrow_choice(parameter: Choice, evidence: _Evidence) -> tuple[Choice, str]:
+    unwanted = [value for value in parameter.values if evidence.is_unwanted(lambda drawn, value=value: drawn == value)]
+    kept = [value for value in parameter.values if value not in unwanted or value in _held(parameter, evidence)]
+    listed = ", ".join(map(evidence.use_of, unwanted))
+    if not unwanted:
+        return parameter, f"kept: no clear preference among {evidence}"
+    if len(kept) == len(parameter.values):
+        return parameter, f"kept, as the baseline or the best trial has it: {listed} among {evidence}"
+    return parameter.model_copy(update={"values": kept}), f"narrowed to {kept}: {evidence} hardly use {listed}"
+
+
+def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence) -> tuple[IntRange | FloatRange, str]:
+    ordered = sorted(evidence.top)
+    lowest, highest = ordered[evidence.spared], ordered[-1 - evidence.spared]
+    low, high = _with_margin(parameter, lowest, highest)
+    held = _held(parameter, evidence)
+    ends = (
+        min(low, *held) if evidence.is_unwanted(lambda value: value < lowest) else parameter.range[0],
+        max(high, *held) if evidence.is_unwanted(lambda value: value > highest) else parameter.range[1],
+    )
+    inside = sum(lowest <= value <= highest for value in evidence.values)
+    facts = (
+        f"{len(ordered) - 2 * evidence.spared} of {evidence} lie in [{lowest:.3g}, {highest:.3g}], "
+        f"as {inside} of all trials do"
+    )
+    if ends == parameter.range:
+        return parameter, f"kept: no clear preference, {facts}"
+    return (
+        parameter.model_copy(update={"range": ends}),
+        f"narrowed to [{ends[0]:.3g}, {ends[1]:.3g}], which holds the baseline, the best trial and a margin: {facts}",
+    )
+
+
+def _held(parameter: Parameter, evidence: _Evidence) -> tuple[Value, Value]:
+    """Values that stay whatever the evidence says."""
+    return parameter.baseline, evidence.top[0]
+
+
+def _with_margin(parameter: IntRange | FloatRange, lowest: float, highest: float) -> tuple[float, float]:
+    """An interval with a margin on the parameter's scale, rounded outwards to whole numbers or three digits."""
+    log = parameter.scale == "log"
+    ends = [math.log(end) if log else float(end) for end in (*parameter.range, lowest, highest)]
+    margin = MARGIN * (ends[1] - ends[0])
+    low, high = (math.exp(end) if log else end for end in (ends[2] - margin, ends[3] + margin))
+    low, high = (math.floor(low), math.ceil(high)) if parameter.type == "int" else (_rounded(low), _rounded(high))
+    return max(low, parameter.range[0]), min(high, parameter.range[1])
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")

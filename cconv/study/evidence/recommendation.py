@@ -1,0 +1,329 @@
+"""Which models to look at closer, and which one to recommend: no more than the scene needs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cconv.data.splits import evenly_spaced
+from cconv.errors import DataError
+from cconv.evaluation.statistics import (
+    PairedRatio,
+    crossed_standard_error,
+    paired_logarithms,
+    paired_ratio,
+    why_no_interval,
+)
+from cconv.study.evidence.front import Timing, pareto_front
+from cconv.study.records.trials import TrialRecord
+
+SHOWN_FAILURES = 2  # of a model, in words
+RULES = ("one_standard_error", "non_inferiority", "accurate_enough")
+
+
+def choose_finalists(
+    records: Sequence[TrialRecord], cost: Mapping[str, float], count: int, accurate_enough: float | None = None
+) -> list[TrialRecord]:
+    """Configurations among those that none is both more accurate and cheaper than, most accurate first.
+
+    The `count` most accurate ones; or, where more of them are accurate enough, `count` evenly spaced from the most
+    accurate to the cheapest of those. Only trials of the full budget compete, by their last validation error.
+
+    Args:
+        records: Trials of the search.
+        cost: Estimated cost of each trial by id, e.g. FLOPs per particle.
+        count: Number of finalists.
+        accurate_enough: Error below which cost alone matters; None for no such limit.
+    """
+    distinct: dict[str, TrialRecord] = {}
+    for record in records:
+        if record.outcome == "completed" and record.last is not None:
+            distinct.setdefault(repr(sorted(record.parameters.items())), record)
+    by_id = {record.id: record for record in distinct.values()}
+    errors = {trial: record.last["valid_normalized_mse"] for trial, record in by_id.items()}
+    front = pareto_front({trial: (errors[trial], cost[trial]) for trial in by_id})[::-1]
+    enough = [trial for trial in front if accurate_enough is not None and errors[trial] <= accurate_enough]
+    if len(enough) > count:
+        front = [enough[place] for place in evenly_spaced(len(enough), count)]
+    return [by_id[trial] for trial in front[:count]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A model beside the best one, by validation errors.
+
+    Attributes:
+        id: Its name.
+        error: Mean validation error over seeds and units.
+        time: ms per frame, by turns.
+        to_best: Its errors by those of the best model, on the same seeds and units.
+        within_one_se: Whether the logarithm of that ratio is at most its standard error, and that of the best's error.
+        non_inferior: Whether the upper end of the ratio's interval is at most 1 + the margin; False without interval.
+        accurate_enough: Whether the error is at most the study's limit; False without one.
+        failures: Checks of stability that it failed.
+        eligible: Whether it may be recommended, by any rule.
+        why_not: Why it may not, or "".
+    """
+
+    id: str
+    error: float
+    time: Timing
+    to_best: PairedRatio
+    within_one_se: bool
+    non_inferior: bool
+    accurate_enough: bool
+    failures: tuple[str, ...]
+    eligible: bool
+    why_not: str
+
+    @property
+    def stable(self) -> bool:
+        """Whether it passed every check of stability."""
+        return not self.failures
+
+    def passes(self, rule: str) -> bool:
+        """Whether it is as good as the best by one of `RULES`."""
+        by_rule = (self.within_one_se, self.non_inferior, self.accurate_enough)
+        return dict(zip(RULES, by_rule, strict=True))[rule]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recommendation:
+    """The model to use, and why.
+
+    Attributes:
+        id: The recommended model.
+        reason: The reason in words.
+        best: The model of the smallest validation error, of those chosen from.
+        tied: Models that are as fast as the fastest eligible one within the noise of the timing, that one included;
+            of these, the recommended one has the smallest validation error.
+        by_rule: The model that each of `RULES` alone would choose, None where it chooses none.
+        comparisons: Every model beside the best, fastest first.
+    """
+
+    id: str
+    reason: str
+    best: str
+    tied: tuple[str, ...]
+    by_rule: dict[str, str | None]
+    comparisons: tuple[Comparison, ...]
+
+
+def recommend(
+    errors: Mapping[str, np.ndarray],
+    times: Mapping[str, Timing],
+    failures: Mapping[str, Sequence[str]],
+    *,
+    accurate_enough: float | None = None,
+    margin: float = 0.05,
+) -> Recommendation:
+    """The fastest stable model that is as accurate as the best one, or accurate enough; ties go to the smaller error.
+
+    It takes validation errors: the error of a model that was chosen by its luck on some units is too small on those
+    very units, so that the test split is for reporting what was chosen. The search for finalists and the choice of each
+    checkpoint went by validation errors as well; for that reason, too, they are never what is reported.
+
+    As accurate is within one standard error of the best, or not inferior: the upper end of the 95 % interval of the
+    ratio of errors is within the margin. The standard error is that of the ratio or that of the best model's own error,
+    whichever is smaller: a model of which one seed failed would pass for its scatter alone. The best is the most
+    accurate of the stable models; if none is stable, all are chosen from, and the reason says so. Models whose times
+    differ by no more than the noise of the timing are ties.
+
+    Sources: the one-standard-error rule of Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3;
+    Chen and Yang, "The One Standard Error Rule for Model Selection: Does It Work?", Stats 4 (2021).
+
+    Args:
+        errors: Validation errors (seeds, units) by model, one row where no seed is drawn; seeds and units are the same.
+        times: ms per frame, by model.
+        failures: Checks of stability that each model failed; those that failed none may be left out.
+        accurate_enough: Error up to which models count as equally accurate; None for no such limit.
+        margin: Margin of non-inferiority, as a share of the best error.
+
+    Raises:
+        DataError: If there is no model, or one has no time.
+    """
+    missing = sorted(errors.keys() - times.keys())
+    if not errors or missing:
+        raise DataError(f"a recommendation needs error and time of each model; missing: {missing or 'every model'}.")
+    comparisons = _comparisons(errors, times, failures, accurate_enough, margin)
+    eligible = [each for each in comparisons if each.eligible]
+    tied = _as_fast_as_the_first(eligible)
+    chosen = min(tied, key=lambda each: each.error)
+    by_rule = {rule: _fastest_by(rule, eligible) for rule in RULES}
+    best = next(each for each in comparisons if each.id == _best(errors, times, failures))
+    words = [
+        _choice(chosen, best, comparisons, tied, accurate_enough),
+        _tie(chosen, tied),
+        _rules(chosen, by_rule, margin, _why_no_interval(errors)),
+        _stability(chosen, comparisons),
+    ]
+    return Recommendation(
+        id=chosen.id,
+        reason=" ".join(filter(None, words)),
+        best=best.id,
+        tied=tuple(each.id for each in tied),
+        by_rule=by_rule,
+        comparisons=comparisons,
+    )
+
+
+def retrained_error(
+    valid: Mapping[str, np.ndarray], test: Mapping[str, np.ndarray], choose: Callable[[Mapping], str]
+) -> dict | None:
+    """Error to expect of the chosen model if it is trained again, free of the luck of the seeds that it was chosen by.
+
+    Validation and test errors of a model share its trained networks: their mean test error is fair to these networks,
+    but if seeds vary much and models little, the chosen one is the one with the lucky seeds. So each seed in turn is
+    left out, a model chosen by the validation errors of the others, and its test error taken with the seed left out.
+
+    Args:
+        valid: Validation errors (seeds, units) by model, one row where no seed is drawn.
+        test: Test errors, likewise.
+        choose: Validation errors to the name of the chosen model.
+
+    Returns:
+        "normalized_mse", mean over the seeds; "choices", how often each model was chosen. None without several seeds.
+    """
+    seeds = max(len(table) for table in valid.values())
+    if seeds < 2:
+        return None
+    found = []
+    for seed in range(seeds):
+        kept = {name: table if len(table) == 1 else np.delete(table, seed, axis=0) for name, table in valid.items()}
+        name = choose(kept)
+        found.append((name, float(test[name][seed % len(test[name])].mean())))
+    names = [name for name, _ in found]
+    return {
+        "normalized_mse": float(np.mean([error for _, error in found])),
+        "choices": {name: names.count(name) for name in dict.fromkeys(names)},
+    }
+
+
+def _best(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], failures: Mapping) -> str:
+    """The most accurate of the stable models, or of all if none is stable."""
+    stable = [name for name in errors if not failures.get(name)]
+    return min(stable or errors, key=lambda name: (float(np.mean(errors[name])), times[name].ms))
+
+
+def _comparisons(
+    errors: Mapping[str, np.ndarray],
+    times: Mapping[str, Timing],
+    failures: Mapping[str, Sequence[str]],
+    accurate_enough: float | None,
+    margin: float,
+) -> tuple[Comparison, ...]:
+    """Every model beside the best, fastest first."""
+    best = _best(errors, times, failures)
+    own_se = crossed_standard_error(paired_logarithms([errors[best]])[0])[0]
+    none_stable = bool(failures.get(best))
+    comparisons = []
+    for name in sorted(errors, key=lambda name: (times[name].ms, float(np.mean(errors[name])))):
+        error, to_best = float(np.mean(errors[name])), paired_ratio(errors[name], errors[best])
+        good = {
+            "within_one_se": to_best.log_ratio <= min(to_best.log_standard_error, own_se),
+            "non_inferior": name == best or (to_best.ci95 is not None and to_best.ci95[1] <= 1 + margin),
+            "accurate_enough": accurate_enough is not None and error <= accurate_enough,
+        }
+        failed = tuple(failures.get(name, ()))
+        unstable = bool(failed) and not none_stable
+        why_not = f"failed {_shortly(failed)}" if unstable else "" if any(good.values()) else "less accurate"
+        facts = {"failures": failed, "eligible": not why_not, "why_not": why_not}
+        comparisons.append(Comparison(id=name, error=error, time=times[name], to_best=to_best, **good, **facts))
+    return tuple(comparisons)
+
+
+def _as_fast_as_the_first(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Those of some models, fastest first, that are not slower than the first beyond the noise of the timing."""
+    return [each for each in comparisons if not each.time.is_slower(comparisons[0].time)]
+
+
+def _fastest_by(rule: str, eligible: Sequence[Comparison]) -> str | None:
+    """What a rule alone would choose."""
+    passing = [each for each in eligible if each.passes(rule)]
+    return min(_as_fast_as_the_first(passing), key=lambda each: each.error).id if passing else None
+
+
+def _choice(
+    chosen: Comparison,
+    best: Comparison,
+    comparisons: Sequence[Comparison],
+    tied: Sequence[Comparison],
+    accurate_enough: float | None,
+) -> str:
+    figures = f"validation error {chosen.error:.3g} at {chosen.time.ms:.3g} ms per frame"
+    if chosen is best:
+        faster = [each for each in comparisons if best.time.is_slower(each.time)]
+        return f"{best.id} is the most accurate model ({figures}), and {_none_faster(best, faster)}."
+    rules = {
+        "one_standard_error": "within one standard error of the best",
+        "non_inferiority": "not inferior to the best",
+        "accurate_enough": f"accurate enough for this study (limit {accurate_enough})",
+    }
+    passed = " and ".join(words for rule, words in rules.items() if chosen.passes(rule))
+    cheapest = (
+        f"the cheapest model ({figures}) that is" if len(tied) == 1 else f"among the cheapest ({figures}) that are"
+    )
+    return (
+        f"{chosen.id} is {cheapest} {passed}. The best is {best.id} with {best.error:.3g} "
+        f"at {best.time.ms:.3g} ms per frame, {best.time.ms / chosen.time.ms:.3g} times the cost.{_ratio(chosen)}"
+    )
+
+
+def _none_faster(best: Comparison, faster: Sequence[Comparison]) -> str:
+    if not faster:
+        return "none is cheaper beyond the noise of the timing"
+    if any(each.stable or not best.stable for each in faster):
+        return "no cheaper one is as accurate"
+    return "no cheaper one is stable"
+
+
+def _ratio(chosen: Comparison) -> str:
+    compared = chosen.to_best
+    low, high = compared.ci95 or (None, None)
+    interval = "" if low is None else f" (95 % interval {low:.3g} to {high:.3g})"
+    return f" The validation error of {chosen.id} is {compared.ratio:.3g} times that of the best{interval}."
+
+
+def _tie(chosen: Comparison, tied: Sequence[Comparison]) -> str:
+    others = [each.id for each in tied if each is not chosen]
+    if not others:
+        return ""
+    return (
+        f"The timing cannot tell {chosen.id} from {', '.join(others)} (now one is faster, now the "
+        "other); of these, it has the smallest validation error."
+    )
+
+
+def _why_no_interval(errors: Mapping[str, np.ndarray]) -> str:
+    return why_no_interval(max(len(table) for table in errors.values()), next(iter(errors.values())).shape[1])
+
+
+def _rules(chosen: Comparison, by_rule: Mapping[str, str | None], margin: float, why_not: str) -> str:
+    if why_not:
+        return f"Whether others are not inferior cannot be told: {why_not}."
+    one_se, non_inferior = by_rule["one_standard_error"], by_rule["non_inferiority"]
+    names = f"one standard error and non-inferiority (margin {100 * margin:g} %)"
+    if one_se == non_inferior:
+        return f"The rules of {names} both choose {'it' if one_se == chosen.id else one_se}."
+    return f"Of the rules of {names}, the first alone would choose {one_se}, the second {non_inferior}."
+
+
+def _stability(chosen: Comparison, comparisons: Sequence[Comparison]) -> str:
+    if not chosen.stable:
+        return (
+            "No model passed every check of stability, so all were chosen from; see what failed before use: "
+            f"{_shortly(chosen.failures)}."
+        )
+    unstable = [each for each in comparisons if not each.stable]
+    if not unstable:
+        return "Every model passed every check of stability."
+    causes = "; ".join(f"{each.id} ({_shortly(each.failures)})" for each in unstable)
+    return (
+        f"It passed every check of stability; {len(unstable)} of {len(comparisons)} models did not and were set aside: "
+        f"{causes}."
+    )
+
+
+def _shortly(failures: Sequence[str]) -> str:
+    more = len(failures) - SHOWN_FAILURES
+    return "; ".join(failures[:SHOWN_FAILURES]) + (f"; and {more} more" if more > 0 else "")

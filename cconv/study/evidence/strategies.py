@@ -1,0 +1,161 @@
+"""What a search spent, and what other strategies would have found, replayed on the curves of trials nothing stopped."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cconv.study.records.rungs import RungTable
+from cconv.study.records.trials import TrialRecord
+
+Curve = Sequence[tuple[int, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Outcome of a strategy.
+
+    Attributes:
+        updates: Updates spent on all trials.
+        best_error: Smallest error at the full budget among the trials that reached it.
+    """
+
+    updates: int
+    best_error: float
+
+
+def spent_updates(records: Sequence[TrialRecord], full_updates: int) -> dict:
+    """Updates that trials of any outcome spent: "updates", "full_updates" had none been stopped, and their "share"."""
+    spent = sum(record.log[-1]["updates"] for record in records if record.log)
+    full = len(records) * full_updates
+    return {"updates": spent, "full_updates": full, "share": spent / full if full else None}
+
+
+def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
+    """(cumulative updates, smallest error of a completed trial) after each trial, from the first completed one on.
+
+    Args:
+        records: Trials in the order in which they were drawn; trials that ran at the same time count one by one.
+    """
+    curve: list[tuple[int, float]] = []
+    spent, best = 0, float("inf")
+    for record in records:
+        spent += record.log[-1]["updates"] if record.log else 0
+        if record.outcome == "completed" and record.last is not None:
+            best = min(best, record.last["valid_normalized_mse"])
+        if best < float("inf"):
+            curve.append((spent, best))
+    return curve
+
+
+def learning_curves(records: Sequence[TrialRecord]) -> dict[str, list[tuple[int, float]]]:
+    """(updates, validation error) at each evaluation of every completed trial whose errors are all finite, by id."""
+    curves = {
+        record.id: [(entry["updates"], entry["valid_normalized_mse"]) for entry in record.log]
+        for record in records
+        if record.outcome == "completed" and record.log
+    }
+    return {trial: curve for trial, curve in curves.items() if all(error is not None for _, error in curve)}
+
+
+def replay_asha(
+    curves: Mapping[str, Curve], rungs: Sequence[int], reduction_factor: int, order: Sequence[str]
+) -> Replay:
+    """ASHA with one worker, which takes the trials in a given order.
+
+    Args:
+        curves: Learning curves up to the full budget, by trial; the rungs are among their evaluations.
+        rungs: Updates of the rungs; the last one is the full budget.
+        reduction_factor: A trial goes on if it is within the best 1 / `reduction_factor` of those before it.
+        order: Names of the trials; a name may come again, as another trial.
+    """
+    table = RungTable(rungs, reduction_factor)
+    spent, finished = 0, []
+    for number, trial in enumerate(order):
+        curve = curves[trial]
+        stop = next((updates for updates, error in curve if not table.record(f"{number}", updates, error)), None)
+        spent += curve[-1][0] if stop is None else stop
+        if stop is None:
+            finished.append(curve[-1][1])
+    return Replay(updates=spent, best_error=min(finished))
+
+
+def replay_little_each(curves: Mapping[str, Curve], updates_each: int, keep: int, trials: Sequence[str] = ()) -> Replay:
+    """Train every trial a little, then the best few to the full budget.
+
+    Source: Egele et al., "The unreasonable effectiveness of early discarding after one epoch in neural network
+    hyperparameter optimization", Neurocomputing (2024).
+
+    Args:
+        curves: Learning curves up to the full budget, by trial.
+        updates_each: Updates after which trials are compared, an evaluation of every curve.
+        keep: Number of trials that go on.
+        trials: Names of the trials, where a name may come again; by default each once.
+    """
+    chosen = [curves[trial] for trial in trials or curves]
+    ranked = sorted(chosen, key=lambda curve: dict(curve)[updates_each])
+    spent = sum(curve[-1][0] if place < keep else updates_each for place, curve in enumerate(ranked))
+    return Replay(updates=spent, best_error=min(curve[-1][1] for curve in ranked[:keep]))
+
+
+def compare_strategies(
+    curves: Mapping[str, Curve], rungs: Sequence[int], reduction_factor: int, *, draws: int = 200, seed: int = 0
+) -> list[dict]:
+    """ASHA, a little of each at every rung for the same updates, and no stopping, on redrawn trials in random order.
+
+    Each draw takes as many trials as there are, with replacement, so that the spread holds both the luck of the order
+    and that of the configurations. A little of each keeps as many trials as ASHA's mean updates pay for, at least one.
+
+    Args:
+        curves: Learning curves up to the full budget, by trial.
+        rungs: Updates of the rungs; the last one is the full budget.
+        reduction_factor: ASHA's.
+        draws: Number of draws.
+        seed: Seed of the draws.
+
+    Returns:
+        One entry a strategy: "strategy" ("asha", "little_each" or "no_stopping"); "updates_each" and "keep", None but
+        for the second; "share", mean updates by those of no stopping; "regret", the geometric mean over draws of its
+        best error divided by the best of the draw, and "regret_range95", 2.5 and 97.5 percentiles of that ratio. Empty
+        if no curve was measured at every rung; others do not count.
+    """
+    curves = {trial: curve for trial, curve in curves.items() if set(rungs) <= set(dict(curve))}
+    if not curves:
+        return []
+    rng, names = np.random.default_rng(seed), list(curves)
+    samples = [[names[index] for index in rng.integers(len(names), size=len(names))] for _ in range(draws)]
+    asha = [replay_asha(curves, rungs, reduction_factor, sample) for sample in samples]
+    mean_spent, entries = np.mean([replay.updates for replay in asha]), []
+    for updates in rungs[:-1]:
+        keep = max(1, int((mean_spent - len(names) * updates) / (rungs[-1] - updates)))
+        replays = [replay_little_each(curves, updates, keep, sample) for sample in samples]
+        entries.append(_strategy("little_each", curves, samples, replays, updates_each=updates, keep=keep))
+    everything = [replay_little_each(curves, rungs[-1], len(names), sample) for sample in samples]
+    return [
+        _strategy("asha", curves, samples, asha),
+        *entries,
+        _strategy("no_stopping", curves, samples, everything),
+    ]
+
+
+def _strategy(
+    name: str,
+    curves: Mapping[str, Curve],
+    samples: Sequence[Sequence[str]],
+    replays: Sequence[Replay],
+    updates_each: int | None = None,
+    keep: int | None = None,
+) -> dict:
+    shares, regrets = [], []
+    for sample, replay in zip(samples, replays, strict=True):
+        chosen = [curves[trial] for trial in sample]
+        shares.append(replay.updates / sum(curve[-1][0] for curve in chosen))
+        regrets.append(replay.best_error / min(curve[-1][1] for curve in chosen))
+    return {
+        "strategy": name,
+        "updates_each": updates_each,
+        "keep": keep,
+        "share": float(np.mean(shares)),
+        "regret": float(np.exp(np.mean(np.log(regrets)))),
+        "regret_range95": [float(end) for end in np.percentile(regrets, (2.5, 97.5))],
+    }

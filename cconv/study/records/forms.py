@@ -1,0 +1,190 @@
+"""What the JSON files of a run folder may hold: a file that does not fit is refused in one line."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field, RootModel
+
+from cconv.errors import DataError
+from cconv.files import read_json
+from cconv.validation import Flag, Id, Name, OpenModel, Real, Value, Whole, validated
+
+OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
+
+
+_Count = Annotated[Whole, Field(ge=0, lt=2**63)]
+
+
+_Error = Annotated[Real, Field(ge=0)]
+
+
+class Entry(OpenModel):
+    """A line of log.jsonl."""
+
+    updates: _Count
+    valid_normalized_mse: _Error | None
+    seconds: _Error
+    train_loss: _Error | None = None
+    learning_rate: Real | None = None
+    diverged: Flag = False
+
+
+class TrainingDescription(OpenModel):
+    """config.json of a training; what costs nothing was known before it began, the rest is None where it failed."""
+
+    stage: Name
+    parameters: dict[str, Value]
+    init_seed: Annotated[Whole, Field(ge=0, lt=2**32)] | None = None
+    num_parameters: _Count | None = None
+    flops_per_particle: _Error | None = None
+    closed_form: Flag = False
+
+
+class Outcome(OpenModel):
+    """outcome.json of a training."""
+
+    outcome: Literal[OUTCOMES]
+    reason: str
+
+
+class _StageSettings(OpenModel):
+    """A stage in study.json."""
+
+    kind: str
+
+
+class _Study(OpenModel):
+    """study.json, as far as a reader of records needs it."""
+
+    format: _Count = 1
+    id: Annotated[str, Field(pattern=r"^[0-9a-f]{1,64}$")] = "0"
+    name: Name = "study"
+    stages: Annotated[dict[Name, _StageSettings], Field(min_length=1, max_length=100)]
+
+
+class _State(OpenModel):
+    """state.json."""
+
+    state: Literal["running", "finished", "interrupted", "failed"]
+    stage: Name
+
+
+class _Rung(OpenModel):
+    """A rung of a stage in rungs.json."""
+
+    updates: _Count
+    recorded: dict[str, _Error]
+
+
+class Rungs(RootModel):
+    """rungs.json."""
+
+    root: dict[Name, list[_Rung]]
+
+
+class _Line(OpenModel):
+    """Something that does not make sense in the data."""
+
+    line: str
+
+
+class _Seeds(OpenModel):
+    """Seeds in environment.json."""
+
+    data: Whole
+    init: Whole
+    search: Whole
+
+
+class _DataFolder(OpenModel):
+    """Data in environment.json."""
+
+    sha256: str
+
+
+class _Environment(OpenModel):
+    """environment.json, as far as the report needs it."""
+
+    started: str
+    packages: dict[str, str | None]
+    seeds: _Seeds
+    data: _DataFolder
+    data_findings: list[_Line] = []
+
+
+class Table(RootModel):
+    """Any other file."""
+
+    root: dict
+
+
+class Result(OpenModel):
+    """What a stage has found, in stages/."""
+
+    kind: str
+    seconds: _Error
+    finalists: dict[Id, dict[str, Value]] = {}
+
+
+class _Model(OpenModel):
+    """The recommended model in summary.json."""
+
+    id: Id
+    reason: str
+
+
+class _Finalist(OpenModel):
+    """A finalist in summary.json."""
+
+    id: Id
+    num_parameters: _Count
+    config: dict
+    test: dict
+    cost: dict
+    stability: dict | None
+
+
+class _Importance(OpenModel):
+    """Importance at a rung in summary.json."""
+
+    updates: _Count
+    trials: _Count
+    why_none: str
+    parameters: dict[str, dict]
+
+
+class _Summary(OpenModel):
+    """summary.json, as far as every reader needs it."""
+
+    study: Name
+    baseline: Name
+    recommended: _Model
+    finalists: Annotated[list[_Finalist], Field(min_length=1)]
+    pareto_front: list[Id]
+    wall_seconds: _Error
+    importance: list[_Importance] = []
+
+
+FORMS = {
+    "study.json": _Study,
+    "environment.json": _Environment,
+    "state.json": _State,
+    "rungs.json": Rungs,
+    "summary.json": _Summary,
+}
+
+
+def read_record(path: Path, form: type[BaseModel] = Table):
+    """Content of a JSON file that fits a form.
+
+    Raises:
+        DataError: If the file is missing or damaged, or a key or value does not fit.
+    """
+    content = read_json(path)
+    validated(form, content, path, DataError)
+    return content
+
+
+def read_rungs(path: Path) -> dict[str, list[dict]]:
+    """Rungs of every stage that has any, from rungs.json."""
+    return read_record(path, Rungs) if path.exists() else {}

@@ -1,0 +1,1 @@
+"""How a training happens: data, queue, pools, a trial."""

@@ -1,0 +1,87 @@
+"""What configurations of a study cost: counted before anything is trained, and the time that follows from the count."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache
+
+from cconv.data.targets import VECTOR_TASKS
+from cconv.evaluation.cost import Cost, surroundings_of
+from cconv.evaluation.cost_model import Estimate, Surroundings, estimate
+from cconv.evaluation.time_model import check_cost_model
+from cconv.study.declared.study_file import StudyConfig, configure
+from cconv.study.records.trials import TrialRecord
+from cconv.study.running.problem import Problem
+
+FEWEST_MEASURED = 5  # models that a check of the cost model takes
+
+
+class CostCounter:
+    """Counts the cost of configurations in a study's scene, from the settings alone.
+
+    Args:
+        study: Settings that configurations leave as they are.
+        problem: Scene and samples; points are counted around the particles of the first validation frame.
+    """
+
+    def __init__(self, study: StudyConfig, problem: Problem):
+        self._study, self._problem = study, problem
+        self._inputs = problem.valid_samples[0].inputs
+        self._surroundings = lru_cache(maxsize=4096)(self._count)
+
+    def __call__(self, parameters: Mapping) -> Estimate:
+        """Cost of one particle's prediction by a configuration.
+
+        Raises:
+            ConfigError: If its cutoff is more than the box allows.
+        """
+        network, _ = configure(parameters, self._study.network, self._study.training)
+        boundary = self._inputs.boundary_features
+        return estimate(
+            network.model_dump(),
+            dim=self._problem.scene.dim,
+            vector_output=self._problem.task in VECTOR_TASKS,
+            boundary_channels=0 if boundary is None else boundary.shape[1],
+            surroundings=self._surroundings(network.relative_cutoff),
+        )
+
+    def _count(self, relative_cutoff: float) -> Surroundings:
+        return surroundings_of(self._inputs, relative_cutoff)
+
+
+def points_of_search(count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]) -> dict:
+    """Error and time of every trial, the time by a cost model that is fitted to measured models and checked on them.
+
+    Args:
+        count: Counts configurations.
+        records: Trials and closed forms.
+        measured: Models that were timed in one run, by the id of the trial that found them.
+
+    Returns:
+        "search_points", an entry a trial, and "cost_model", the check; empty with fewer than five measured models.
+    """
+    by_id = {record.id: record for record in records}
+    known = {name: cost for name, cost in measured.items() if name in by_id}
+    if len(known) < FEWEST_MEASURED:
+        return {}
+    check = check_cost_model(
+        {name: count(by_id[name].parameters) for name in known},
+        {name: cost.us_per_particle for name, cost in known.items()},
+    )
+    particles = next(iter(known.values())).num_particles
+
+    def point(record: TrialRecord) -> dict:
+        measurement = known.get(record.id)
+        predicted = 1e-3 * particles * check.time_model.predict(count(record.parameters))
+        return {
+            "id": record.id,
+            "stage": record.stage,
+            "valid_normalized_mse": record.last["valid_normalized_mse"],
+            "ms_per_frame": predicted if measurement is None else measurement.ms_per_frame,
+            "measured": measurement is not None,
+            "num_parameters": record.config["num_parameters"],
+            "outcome": record.outcome,
+            "parameters": record.parameters,
+        }
+
+    points = [point(record) for record in records if record.last is not None]
+    return {"search_points": points, "cost_model": asdict(check)}

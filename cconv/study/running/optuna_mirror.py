@@ -1,0 +1,221 @@
+"""Our trials as an Optuna study, live, in a journal file or a database that Optuna's tools open.
+
+Nothing of ours reads it: the records are the truth. Only a trial of the full budget is COMPLETE; one that ended earlier
+is PRUNED with its errors at each evaluation, so that errors of different budgets are never compared as equals.
+"""
+
+import math
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import optuna
+from optuna.exceptions import StorageInternalError
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import Trial, TrialState, create_trial
+from sqlalchemy.exc import SQLAlchemyError
+
+from cconv.errors import ConfigError
+from cconv.study.declared.domains import SearchSpace
+from cconv.study.records.trials import DIVERGED_ERROR, TrialRecord
+from cconv.study.running.sampling import distributions_of
+
+CONNECTION_SECONDS = 10
+LOCK_FILE_SUFFIX = ".lock"
+
+
+def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
+    """Optuna's storage: a journal file, or the database at `url`, e.g. ``postgresql+psycopg://user@host/studies``.
+
+    Raises:
+        ConfigError: If the database cannot be reached or its driver is not installed.
+    """
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    if url is None:
+        return JournalStorage(JournalFileBackend(str(journal)))
+    waits = {"connect_timeout": CONNECTION_SECONDS} if url.startswith("postgresql") else {}
+    try:
+        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True, "connect_args": waits})
+    except Exception as error:  # of SQLAlchemy, of the driver, or of the import of the driver
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"--storage {_without_password(url)}: no database there that Optuna can use ({reason}); "
+            "start it, or leave --storage out for a journal file in the run folder."
+        ) from error
+
+
+def open_mirror(
+    journal: Path,
+    url: str | None,
+    study_name: str,
+    space: SearchSpace,
+    full_updates: int,
+    records: Sequence[TrialRecord],
+) -> "OptunaMirror":
+    """The mirror of a study in the database at `url`, or in a journal file that only this process writes.
+
+    A journal that is damaged or lacks trials is written anew from the records, and a lock that a killed process left
+    behind is removed.
+
+    Args:
+        journal: The journal file.
+        url: Database to use instead, or None.
+        study_name: Name of the Optuna study.
+        space: Search space of all trials.
+        full_updates: Full budget.
+        records: Trials of the searches so far.
+
+    Raises:
+        ConfigError: If the database cannot be reached or the journal not written.
+    """
+    known = [record.id for record in records]
+    if url is not None:
+        return OptunaMirror(open_storage(journal, url), study_name, space, full_updates, known)
+    try:
+        for left in journal.parent.glob(f"{journal.name}{LOCK_FILE_SUFFIX}*"):
+            _delete(left)
+        mirror = _readable_mirror(journal, study_name, space, full_updates, known)
+        if mirror is None or mirror.lacks(record.id for record in records if record.outcome != "interrupted"):
+            _delete(journal)
+            mirror = OptunaMirror(open_storage(journal), study_name, space, full_updates, [])
+            mirror.replay(records)
+    except OSError as error:
+        raise ConfigError(
+            f"{journal}: cannot be written ({error.strerror}); make its folder writable or give --storage URL."
+        ) from error
+    return mirror
+
+
+def _readable_mirror(
+    journal: Path, study_name: str, space: SearchSpace, full_updates: int, known: Iterable[str]
+) -> "OptunaMirror | None":
+    """The mirror in a journal; None where it holds anything that Optuna did not write."""
+    try:
+        if journal.exists() and not journal.read_bytes().endswith(b"\n"):
+            return None  # Optuna would append to half a line
+        return OptunaMirror(open_storage(journal), study_name, space, full_updates, known)
+    except Exception:  # what garbage raises depends on what it looks like
+        return None
+
+
+def _delete(path: Path) -> None:
+    """Delete a file, link or folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def database_answers(url: str | None) -> Iterator[None]:
+    """Say in one line that the database at `url` went away.
+
+    Raises:
+        ConfigError: If Optuna says so inside.
+    """
+    try:
+        yield
+    except (StorageInternalError, SQLAlchemyError) as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ConfigError(
+            f"--storage {_without_password(url or 'optuna.journal')}: the database no longer answers ({reason}); "
+            "start it, then `cconv study resume` with the same --storage."
+        ) from error
+
+
+def _without_password(url: str) -> str:
+    scheme, separator, rest = url.partition("://")
+    login, at, place = rest.rpartition("@")
+    return f"{scheme}{separator}{login.partition(':')[0]}{at}{place}"
+
+
+class OptunaMirror:
+    """An observer that repeats what it sees in an Optuna study.
+
+    A trial that the storage holds already goes on there; one that it holds as running and that no record knows failed.
+
+    Args:
+        storage: Where the study is.
+        study_name: Its name.
+        space: Search space of all trials, refined ones included.
+        full_updates: Full budget.
+        known: Names of the trials that are on record.
+    """
+
+    def __init__(
+        self, storage: BaseStorage, study_name: str, space: SearchSpace, full_updates: int, known: Iterable[str]
+    ):
+        self._study = optuna.create_study(
+            storage=storage, study_name=study_name, direction="minimize", load_if_exists=True
+        )
+        self._space, self._full_updates = space, full_updates
+        self._numbers: dict[str, int] = {}
+        known = set(known)
+        for trial in self._study.get_trials(deepcopy=False):
+            name = trial.user_attrs.get("trial")
+            if name in known and trial.state != TrialState.FAIL:
+                self._numbers[name] = trial.number
+            elif not trial.state.is_finished():
+                self._study.tell(trial.number, state=TrialState.FAIL)
+
+    def lacks(self, names: Iterable[str]) -> bool:
+        """Whether any of the named trials is not in the storage."""
+        present = {trial.user_attrs.get("trial") for trial in self._study.get_trials(deepcopy=False)}
+        return not set(names) <= present
+
+    def replay(self, records: Iterable[TrialRecord]) -> None:
+        """Add trials as their records tell them; one that was cut short is left running, as it goes on."""
+        for record in records:
+            self.on_trial_start(record.id, record.parameters)
+            for entry in record.log:
+                self.on_trial_result(record.id, entry)
+            if record.outcome != "interrupted":
+                self.on_trial_end(record.id, record.outcome, record.reason)
+
+    def end_running(self) -> None:
+        """Tell FAIL for every trial that is still running, so that none is left so when a run ends early."""
+        for trial in self._study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
+            self._study.tell(trial.number, state=TrialState.FAIL)
+
+    def on_data(self, findings: Sequence[str]) -> None:
+        """Nothing: Optuna knows no data."""
+
+    def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
+        """Nothing: all searches share the study."""
+
+    def on_trial_start(self, trial: str, parameters: Mapping) -> None:
+        """Add a running trial."""
+        if trial in self._numbers:
+            return
+        running = create_trial(
+            state=TrialState.RUNNING,
+            params=dict(parameters),
+            distributions=distributions_of(self._space, parameters),
+            user_attrs={"trial": trial},
+        )
+        self._study.add_trial(running)
+        self._numbers[trial] = len(self._study.get_trials(deepcopy=False)) - 1
+
+    def on_trial_result(self, trial: str, entry: Mapping) -> None:
+        """Add the error of an evaluation; a huge one where the trial diverged, so that samplers keep away."""
+        frozen = self._frozen(trial)
+        error = entry["valid_normalized_mse"]
+        value = DIVERGED_ERROR if entry["diverged"] or error is None else error
+        if entry["updates"] not in frozen.intermediate_values and not frozen.state.is_finished():
+            Trial(self._study, frozen._trial_id).report(value, entry["updates"])
+
+    def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
+        """COMPLETE with the last error at the full budget, PRUNED below it, FAIL without any error."""
+        frozen = self._frozen(trial)
+        if frozen.state.is_finished():
+            return
+        values = frozen.intermediate_values
+        if outcome == "completed" and math.isfinite(values.get(self._full_updates, math.nan)):
+            self._study.tell(frozen.number, values[self._full_updates])
+        else:
+            self._study.tell(frozen.number, state=TrialState.PRUNED if values else TrialState.FAIL)
+
+    def _frozen(self, trial: str):
+        return self._study.get_trials(deepcopy=False)[self._numbers[trial]]

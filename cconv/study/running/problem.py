@@ -1,0 +1,177 @@
+"""What all trials of a study share: the scene, the task and its samples."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from cconv.data.dataset import Dataset, open_dataset
+from cconv.data.metadata import OVERRIDES
+from cconv.data.targets import Sample, iterate_samples
+from cconv.data.trajectory import Scene
+from cconv.errors import ConfigError
+from cconv.models.model import FieldModel, NetworkConfig, build_field_model
+from cconv.sph.kernels import kernel_named
+from cconv.study.declared.study_file import DataConfig, StudyConfig
+from cconv.validation import PathText, check_setting, validated
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Scene, task and samples of a study.
+
+    Attributes:
+        scene: What all trajectories share.
+        task: "density_rate" or "density_gradient".
+        kernel: Field name of the SPH kernel.
+        smoothing_length: Its h, length.
+        train_samples: Frames to learn from; features and targets are standardised by them.
+        valid_samples: Frames that the search compares by.
+    """
+
+    scene: Scene
+    task: str
+    kernel: str
+    smoothing_length: float
+    train_samples: list[Sample]
+    valid_samples: list[Sample]
+
+    def build_model(self, network: NetworkConfig, init_seed: int) -> FieldModel:
+        """A fresh model with the initial weights of `init_seed`."""
+        return build_field_model(
+            network,
+            self.scene,
+            self.task,
+            self.kernel,
+            self.smoothing_length,
+            self.train_samples,
+            torch.Generator().manual_seed(init_seed),
+        )
+
+
+def open_study_data(data: DataConfig, data_seed: int) -> Dataset:
+    """The data set of a study.
+
+    Raises:
+        ConfigError: If the study names none.
+        DataError: If it cannot be read.
+    """
+    if data.path is None:
+        raise ConfigError("`data.path` is missing; name it in the study file or give --data FOLDER.")
+    return open_dataset(
+        data.path,
+        mass=data.mass,
+        particle_spacing=data.particle_spacing,
+        frame_dt=data.frame_dt,
+        force=data.force,
+        split_fractions=data.split_fractions,
+        gap=data.gap,
+        data_seed=data_seed,
+    )
+
+
+def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
+    """The study on the data at `path`.
+
+    Raises:
+        ConfigError: If study.json could not hold that path.
+    """
+    check_setting(PathText, path, "--data")
+    return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
+
+
+def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[Sample]:
+    """Samples of a split with the study's task and kernel."""
+    kernel = kernel_named(study.data.kernel)(smoothing_length(study.data, dataset.scene), dataset.scene.dim)
+    return iterate_samples(dataset, split, study.task, kernel)
+
+
+def smoothing_length(data: DataConfig, scene: Scene) -> float:
+    """The study's smoothing length; the particle spacing unless set."""
+    return data.smoothing_length or scene.particle_spacing
+
+
+def load_problem(
+    study: StudyConfig, dataset: Dataset, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
+) -> Problem:
+    """Training and validation samples of a study; the test split stays untouched.
+
+    Args:
+        study: The study.
+        dataset: Its data.
+        progress: Wraps an iterable to show progress, given a label.
+    """
+    problem = Problem(
+        scene=dataset.scene,
+        task=study.task,
+        kernel=study.data.kernel,
+        smoothing_length=smoothing_length(study.data, dataset.scene),
+        train_samples=[],
+        valid_samples=[],
+    )
+    samples = {split: list(progress(study_samples(study, dataset, split), split)) for split in ("train", "valid")}
+    return replace(problem, train_samples=samples["train"], valid_samples=samples["valid"])
+
+
+def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
+    """What a checkpoint's card says of the data, so that its errors can be computed again.
+
+    Args:
+        study: The study.
+        dataset: Its data, of which a fingerprint is kept; None where that follows later.
+    """
+    fingerprint = {} if dataset is None else {"data_sha256": dataset.fingerprint()}
+    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json"), **fingerprint}
+
+
+def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None = None) -> tuple[Dataset, bool]:
+    """The data that a checkpoint is asked on: those of its card, or others.
+
+    What the card says of masses, spacing, time and force holds for the data that the model was trained on, in their
+    folder or in another with the same content. Other data speak for themselves.
+
+    Args:
+        card: Card of the checkpoint.
+        path: Folder of the data; None for the card's.
+        given: `mass`, `particle_spacing`, `frame_dt` and `force` as the user says; None where he does not.
+
+    Returns:
+        The data set, and whether the model was trained on it.
+
+    Raises:
+        ConfigError: If the card's settings do not fit, or other data lack what the card says of its own.
+        DataError: If the data cannot be read.
+    """
+    own = validated(DataConfig, card.get("data", {}), "card.json, data")
+    seed = card.get("data_seed", 0)
+    said = {name: value for name, value in (given or {}).items() if value is not None}
+    of_card = _with(own, {"path": path or own.path} | said)
+    if path is None or _same_folder(path, own.path):
+        return open_study_data(of_card, seed), True
+    other = open_study_data(_with(own, dict.fromkeys(OVERRIDES) | {"path": path} | said), seed)
+    if "data_sha256" in card and other.fingerprint() == card["data_sha256"]:
+        return open_study_data(of_card, seed), True
+    for name in ("mass", "particle_spacing"):
+        _check_stored(other, name, getattr(own, name), said)
+    return other, False
+
+
+def _with(data: DataConfig, changes: Mapping) -> DataConfig:
+    return validated(DataConfig, data.model_dump() | changes, "data")
+
+
+def _same_folder(path: str, other: str | None) -> bool:
+    return other is not None and Path(path).resolve() == Path(other).resolve()
+
+
+def _check_stored(other: Dataset, name: str, of_card: float | None, said: Mapping) -> None:
+    """Refuse data that lack what the card says of its own data, unless the user says it."""
+    topic = f"{OVERRIDES[name]}: "
+    lines = [line.removeprefix(topic) for line in other.scene.missing if line.startswith(topic)]
+    if lines and of_card is not None and name not in said:
+        option = name.replace("_", "-")
+        raise ConfigError(
+            f"{other.path}: {topic}{lines[0]}; the model's own data have {of_card:g}, which need not hold here; give "
+            f"--{option}."
+        )

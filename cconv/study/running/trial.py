@@ -1,0 +1,138 @@
+"""One trial: a configuration trained, evaluated and recorded. Knows nothing of Ray."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+
+from cconv.evaluation.cost import flops_per_particle
+from cconv.models.checkpoint import read_card, save_model
+from cconv.models.model import FieldModel, NetworkConfig
+from cconv.study.declared.study_file import TrainingConfig, configure
+from cconv.study.records.trials import TrialFolder
+from cconv.study.running.problem import Problem
+from cconv.training.loop import TrainingState, train
+from cconv.training.progress import Progress, begin, load_progress, save_progress
+
+
+def run_trial(
+    problem: Problem,
+    parameters: Mapping,
+    network: NetworkConfig,
+    training: TrainingConfig,
+    folder: TrialFolder,
+    *,
+    stage: str,
+    init_seed: int,
+    data_seed: int,
+    provenance: Mapping,
+    seconds_limit: float = math.inf,
+    on_update: Callable[[TrainingState], None] = lambda state: None,
+) -> Iterator[dict]:
+    """Train one configuration, from where an earlier process left it; yields an entry at every evaluation.
+
+    Everything is on disk before an entry is yielded: the log, the progress from which a killed training goes on, and
+    the checkpoint of the best validation error so far; on Ctrl-C before the first evaluation the checkpoint is the
+    model as it stands. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
+
+    Args:
+        problem: Scene, task and samples.
+        parameters: Hyperparameters that replace those of `network` and `training`.
+        network: The study's network settings.
+        training: The study's training settings.
+        folder: Where config.json, log.jsonl, progress.safetensors and checkpoint/ are written.
+        stage: Stage that the trial belongs to.
+        init_seed: Seed of the initial weights.
+        data_seed: Seed of the batch order.
+        provenance: Where the data come from, for the checkpoint's card.
+        seconds_limit: Time that the training may take in all; it ends at the first update after that.
+        on_update: Sees the state after every update.
+    """
+    network, training = configure(parameters, network, training)
+    model = problem.build_model(network, init_seed)
+    config = describe(problem, parameters, model, training, stage=stage, init_seed=init_seed, data_seed=data_seed)
+    progress = _begin_or_go_on(model, folder, config)
+    card = config | dict(provenance)
+    best = _best_so_far(folder)
+    states = train(
+        model,
+        problem.train_samples,
+        problem.valid_samples,
+        updates=training.updates,
+        evaluate_every=training.evaluate_every,
+        batch_size=training.batch_size,
+        learning_rate=training.learning_rate,
+        schedule=training.schedule,
+        data_seed=data_seed,
+        cache_bytes=training.cache_megabytes * 2**20,
+        progress=progress,
+    )
+    try:
+        for state in states:
+            on_update(state)
+            if state.valid_normalized_mse is None and not state.diverged:
+                if state.seconds > seconds_limit:
+                    return
+                continue
+            entry = _entry(state)
+            if not state.diverged and state.valid_normalized_mse < best:
+                best = state.valid_normalized_mse
+                save_model(model, folder.checkpoint, card | {"valid_normalized_mse": best, "updates": state.updates})
+            folder.append(entry)
+            save_progress(folder.progress, model, progress)
+            yield entry
+    except KeyboardInterrupt:
+        if not folder.checkpoint.exists():
+            save_model(model, folder.checkpoint, card | {"valid_normalized_mse": None})
+        raise
+
+
+def describe(
+    problem: Problem,
+    parameters: Mapping,
+    model: FieldModel,
+    training: TrainingConfig,
+    *,
+    stage: str,
+    init_seed: int,
+    data_seed: int,
+) -> dict:
+    """What config.json says of a model and its training before it begins; arguments as of `run_trial`."""
+    return {
+        "stage": stage,
+        "parameters": dict(parameters),
+        "network": model.config.network.model_dump(),
+        "training": training.model_dump(),
+        "init_seed": init_seed,
+        "data_seed": data_seed,
+        "num_parameters": model.num_parameters,
+        "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
+    }
+
+
+def _begin_or_go_on(model: FieldModel, folder: TrialFolder, config: Mapping) -> Progress:
+    if not folder.progress.is_file():
+        folder.start(config)
+        return begin(model)
+    progress = load_progress(folder.progress, model)
+    folder.go_on(progress.updates)
+    return progress
+
+
+def _best_so_far(folder: TrialFolder) -> float:
+    """Validation error of the checkpoint of an earlier process; infinity where there is none."""
+    known = read_card(folder.checkpoint).get("valid_normalized_mse") if folder.progress.is_file() else None
+    return math.inf if known is None else known
+
+
+def _entry(state: TrainingState) -> dict:
+    return {
+        "updates": state.updates,
+        "train_loss": _finite(state.train_loss),
+        "valid_normalized_mse": _finite(state.valid_normalized_mse),
+        "learning_rate": state.learning_rate,
+        "seconds": state.seconds,
+        "diverged": state.diverged,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,258 @@
+"""The closed-form stage: least squares for every single linear layer that a search space holds.
+
+Such a layer needs no training and no seed: its coefficients are the solution of linear equations. Candidates are fitted
+to a few frames and compared on a few others; some of those that none beats in error and cost are fitted to the whole
+training split and become finalists.
+"""
+
+import math
+import random
+import time
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate
+
+import numpy as np
+
+from cconv.data.splits import evenly_spaced
+from cconv.data.targets import Sample
+from cconv.errors import ConfigError
+from cconv.models.checkpoint import save_model
+from cconv.models.closed_form import solve_closed_form
+from cconv.models.errors import frame_errors, normalized_mse
+from cconv.models.model import NetworkConfig
+from cconv.study.declared.domains import Choice, Parameter, SearchSpace
+from cconv.study.declared.stage_tables import reads_of
+from cconv.study.declared.study_file import configure
+from cconv.study.evidence.recommendation import choose_finalists
+from cconv.study.records.trials import TrialFolder, TrialRecord
+from cconv.study.running.problem import provenance
+from cconv.study.running.trial import describe
+from cconv.study.stages.search import trial_name
+from cconv.study.stages.session import Session
+from cconv.validation import Value
+
+STAGE = "closed_form"
+MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
+BRANCHES = ("boundary", "density")  # what a model may do without
+_OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message", "boundary", "density")
+_OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"), "radial": ("radial_terms",)}
+
+
+def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: int) -> list[dict[str, Value]]:
+    """Distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
+
+    Conditions hold as in the search. A space of deeper networks only has single layers too, as a floor to compare with.
+    Of a space that holds more than `MOST_LAYERS` of them, so many are drawn at random.
+
+    Args:
+        space: The search space.
+        network: Settings that the space does not vary.
+        values_per_range: Values taken of a range of numbers.
+    """
+    drawn: list[dict] = [{}]
+    for name in space.parents_first:
+        values = [1] if name == "layers" else _values(space.parameters[name], values_per_range)
+        if name in ("layers", *_OF_ANY, *_OF_BASIS["grid"], *_OF_BASIS["radial"]):
+            choices = [{name: value} for value in values]
+            drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
+    layers: dict[str, dict] = {}
+    for values in drawn:
+        basis = values.get("basis", network.basis)
+        applies = (*_OF_ANY, *_OF_BASIS[basis])
+        layer = {"layers": 1, "basis": basis, **{name: value for name, value in values.items() if name in applies}}
+        layers.setdefault(layer_id(layer), layer)
+    return list(layers.values())
+
+
+def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
+    """Each layer with each of its choices, in order; `MOST_LAYERS` of them, drawn at random, where there are more."""
+    ends = list(accumulate(map(len, choices)))
+    places = range(ends[-1])
+    if len(places) > MOST_LAYERS:
+        places = sorted(random.Random(0).sample(places, MOST_LAYERS))
+    owners = ((place, bisect_right(ends, place)) for place in places)
+    return [layers[owner] | choices[owner][place - ends[owner]] for place, owner in owners]
+
+
+def screen_closed_forms(session: Session, stage: str) -> dict:
+    """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
+
+    Half of them are drawn from all layers that the space holds, as many of each basis; the others are proposed from
+    the records of those before.
+    """
+    settings, problem = session.study.stages[stage], session.problem
+    layers = single_layers(session.space, session.study.network, settings.values_per_range)
+    samples = tuple(
+        [split[place] for place in evenly_spaced(len(split), settings.screening_frames)]
+        for split in (problem.train_samples, problem.valid_samples)
+    )
+    untried = {layer_id(layer): layer for layer in layers}
+    batch = _draw(layers, (settings.max_candidates + 1) // 2, session.seed_of(stage))
+    number = 0
+    while batch and number < settings.max_candidates:
+        for layer in batch:
+            del untried[layer_id(layer)]
+        affordable = [layer for layer in batch if session.affordable(layer)][: settings.max_candidates - number]
+        for layer in session.progress(affordable, "closed forms"):
+            folder = session.run.trial(trial_name(stage, number))
+            _fit_and_record(session, layer, samples, folder, stage, session.study.seeds.init, settings.ridge)
+            number += 1
+        batch = propose(_winners(session, stage), list(untried.values()))
+    return {}
+
+
+def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]]) -> list[dict[str, Value]]:
+    """The layers to fit next, given those that would become finalists now; none where nothing near them is left.
+
+    First the winners with every other number of basis functions, which decides more than anything else; then the
+    layers that differ from a winner in one setting. The most accurate winner comes first.
+    """
+    with_other_terms = [layer for record in winners for layer in untried if _same_but_terms(record, layer)]
+    if with_other_terms:
+        return list({layer_id(layer): layer for layer in with_other_terms}.values())
+    return next(filter(None, (_neighbors(record.parameters, untried) for record in winners)), [])
+
+
+def _same_but_terms(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
+    """Whether a layer differs from that of a record in the number of its basis functions alone."""
+    return "radial_terms" in layer and record.parameters | {"radial_terms": layer["radial_terms"]} == layer
+
+
+def layer_id(layer: Mapping[str, Value]) -> str:
+    """What two layers share only if they are the same."""
+    return repr(sorted(layer.items()))
+
+
+def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
+    """The layers that differ in one setting; what comes and goes with a basis counts with it."""
+    return [other for other in others if sum(layer[name] != other[name] for name in layer if name in other) == 1]
+
+
+def _winners(session: Session, stage: str) -> list[TrialRecord]:
+    """The candidates that would become finalists, most accurate first."""
+    records = session.run.trials_of(stage)
+    cost = {record.id: record.config["flops_per_particle"] for record in records}
+    count = session.study.stages[stage].count
+    return choose_finalists(records, cost, count, session.study.selection.accurate_enough)
+
+
+def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[str, dict[str, Value]]:
+    """Fit the best candidates to the whole training split, without the branches and features that they do not need.
+
+    Each is fitted once, as nothing in it is drawn.
+
+    Args:
+        session: The study.
+        stage: The stage of the finalists, which reads stages of closed forms.
+        seed: Seed that names the folder.
+
+    Returns:
+        Hyperparameters of the finalists, by id; that of one that lost a branch says so.
+    """
+    study, chosen = session.study, {}
+    for name in reads_of(study.stages, stage):
+        if study.stages[name].kind == STAGE:
+            for record in session.progress(_winners(session, name), "closed-form finalists"):
+                finalist, parameters = _lean(session, record, seed, study.stages[name].ridge)
+                chosen.setdefault(layer_id(parameters), (finalist, parameters))
+    return dict(chosen.values())
+
+
+def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> tuple[str, dict[str, Value]]:
+    """Id and hyperparameters of a candidate without the `BRANCHES` whose loss its validation error does not show.
+
+    A branch goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
+    """
+
+    def fitted(finalist: str, parameters: Mapping[str, Value]) -> float:
+        folder = session.run.finalist(finalist, seed)
+        fit_whole(session, parameters, folder, "finalists", seed, ridge)
+        return folder.read().best
+
+    finalist, parameters = candidate.id, candidate.parameters
+    error = fitted(finalist, parameters)
+    for branch in BRANCHES:
+        if parameters.get(branch) and False in session.space.parameters[branch].values:
+            leaner, fewer = f"{finalist}_no_{branch}", parameters | {branch: False}
+            error_without = fitted(leaner, fewer)
+            if error_without <= error * (1 + session.study.selection.margin):
+                finalist, parameters, error = leaner, fewer, error_without
+    return finalist, parameters
+
+
+def fit_whole(
+    session: Session, parameters: Mapping[str, Value], folder: TrialFolder, stage: str, seed: int, ridge: float
+) -> None:
+    """Fit a layer to the whole training split and record its error on the whole validation split."""
+    samples = session.problem.train_samples, session.problem.valid_samples
+    _fit_and_record(session, parameters, samples, folder, stage, seed, ridge)
+
+
+def _fit_and_record(
+    session: Session,
+    parameters: Mapping[str, Value],
+    samples: tuple[Sequence[Sample], Sequence[Sample]],
+    folder: TrialFolder,
+    stage: str,
+    init_seed: int,
+    ridge: float,
+) -> None:
+    """Fit a layer to the first of `samples` and record its error on the second. No weight depends on the seed."""
+    folder.check_begun_with(parameters)
+    if folder.ended:
+        return
+    study, problem = session.study, session.problem
+    network, training = configure(parameters, study.network, study.training)
+    model = problem.build_model(network, 0)
+    untrained = training.model_copy(update={"updates": 0})
+    seeds = {"init_seed": init_seed, "data_seed": study.seeds.data}
+    config = describe(problem, parameters, model, untrained, stage=stage, **seeds) | {
+        "closed_form": True,
+        "ridge": ridge,
+    }
+    folder.start(config)
+    train, valid = samples
+    start = time.perf_counter()
+    try:
+        solve_closed_form(model, train, ridge)
+    except ConfigError as error:
+        folder.finish("failed", str(error))
+        return
+    error = normalized_mse(frame_errors(model, valid))
+    if not math.isfinite(error):
+        folder.finish("failed", "its predictions are not finite")
+        return
+    entry = {
+        "updates": 0,
+        "train_loss": None,
+        "valid_normalized_mse": error,
+        "learning_rate": None,
+        "seconds": time.perf_counter() - start,
+        "diverged": False,
+    }
+    folder.append(entry)
+    card = config | provenance(study) | {"valid_normalized_mse": entry["valid_normalized_mse"], "updates": 0}
+    save_model(model.eval(), folder.checkpoint, card)
+    folder.finish("completed")
+
+
+def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[str, Value]]:
+    """At most `count` layers, as many of each basis as there are, drawn at random where there are more."""
+    drawn = [layers[index] for index in np.random.default_rng(seed).permutation(len(layers))]
+    rank = Counter()
+    ranked = []
+    for layer in drawn:
+        rank[layer["basis"]] += 1
+        ranked.append((rank[layer["basis"]], layer))
+    chosen = [layer for _, layer in sorted(ranked, key=lambda item: item[0])[:count]]
+    return [layer for layer in layers if layer in chosen]
+
+
+def _values(domain: Parameter, count: int) -> list[Value]:
+    if isinstance(domain, Choice):
+        return list(domain.values)
+    low, high = domain.range
+    spaced = np.geomspace(low, high, count) if domain.scale == "log" else np.linspace(low, high, count)
+    return sorted({round(value) if domain.type == "int" else float(value) for value in spaced})

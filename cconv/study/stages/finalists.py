@@ -1,0 +1,204 @@
+"""Finalists: the best configurations and the baseline retrained with fresh seeds, tested and timed."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cconv.data.targets import Sample
+from cconv.errors import DataError, StudyError
+from cconv.evaluation.cost import Cost
+from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
+from cconv.evaluation.statistics import crossed_interval, why_no_interval
+from cconv.models.checkpoint import load_model, read_card, save_model
+from cconv.models.errors import frame_errors, normalized_mse
+from cconv.study.declared.stage_tables import BASELINE
+from cconv.study.declared.study_file import StudyConfig, TrainingConfig
+from cconv.study.evidence.budget import fall_at_the_end
+from cconv.study.evidence.recommendation import choose_finalists
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.records.trials import TrialRecord
+from cconv.study.running.trial_queue import Job, job_in
+from cconv.study.stages.closed_form import fit_closed_form_finalists
+from cconv.study.stages.search import train_all
+from cconv.study.stages.session import Session
+
+FINALISTS = "finalists"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finalist:
+    """A configuration that is retrained.
+
+    Attributes:
+        id: "baseline" or the id of the trial that found it.
+        parameters: Its hyperparameters.
+    """
+
+    id: str
+    parameters: dict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retrained:
+    """A finalist all of whose retrainings finished.
+
+    Attributes:
+        id: Its id.
+        records: Its retrainings, one a seed.
+        checkpoints: Checkpoint folder of each.
+    """
+
+    id: str
+    records: list[TrialRecord]
+    checkpoints: list[Path]
+
+    @property
+    def valid_errors(self) -> list[float]:
+        """Validation error of each checkpoint: the best of its evaluations."""
+        return [record.best for record in self.records]
+
+    @property
+    def best_checkpoint(self) -> Path:
+        """Checkpoint of the smallest validation error."""
+        return self.checkpoints[int(np.argmin(self.valid_errors))]
+
+
+def retrain_finalists(session: Session, stage: str) -> dict:
+    """Retrain the baseline, named configurations and the best of the searches with fresh seeds; fit the closed forms.
+
+    Returns:
+        "finalists": the hyperparameters of each, by id.
+
+    Raises:
+        StudyError: If none of them finished its training.
+    """
+    study, settings = session.study, session.study.stages[stage]
+    first_seed = study.seeds.init + 1
+    closed = fit_closed_form_finalists(session, stage, first_seed)
+    named = {BASELINE: session.space.baseline, **settings.include}
+    searched = {record.id: record.parameters for record in best_trials(session, stage)}
+    trained = [Finalist(id=name, parameters=parameters) for name, parameters in (named | searched).items()]
+    jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
+    train_all(session, FINALISTS, jobs, finalist_training(study))
+    finalists = named | searched | closed
+    check_any_finished(session.run, *retrained_finalists(session.run, finalists, study.finalists.seeds))
+    return {"finalists": finalists}
+
+
+def check_any_finished(run: RunFolder, finished: Sequence[Retrained], failed: Mapping[str, str]) -> None:
+    """Raise `StudyError` with what became of each finalist unless one of them finished its training."""
+    if not finished:
+        ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
+        raise StudyError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
+
+
+def best_trials(session: Session, stage: str) -> list[TrialRecord]:
+    """The best trained configurations of the searches that a stage reads, the baseline's own left out."""
+    records = session.read(stage, "random", "adaptive")
+    others = [record for record in records if record.parameters != session.space.baseline]
+    cost = {record.id: record.config["flops_per_particle"] for record in others}
+    count, enough = session.study.stages[stage].count, session.study.selection.accurate_enough
+    return choose_finalists(others, cost, count, enough)
+
+
+def finalist_training(study: StudyConfig) -> TrainingConfig:
+    """Training settings of the finalists: the search's, with their own budget."""
+    return study.training.model_copy(update={"updates": study.finalists.updates or study.training.updates})
+
+
+def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int, run: RunFolder) -> list[Job]:
+    """Trainings of every finalist with `num_seeds` initialisation seeds that the search did not use.
+
+    They run in this order; the costliest finalist, usually the baseline, is best given first.
+    """
+    return [
+        job_in(run.finalist(finalist.id, seed), f"{finalist.id}/seed_{seed}", finalist.parameters, seed)
+        for finalist in finalists
+        for seed in range(first_seed, first_seed + num_seeds)
+    ]
+
+
+def retrained_finalists(
+    run: RunFolder, finalists: Iterable[str], num_seeds: int
+) -> tuple[list[Retrained], dict[str, str]]:
+    """Finalists all of whose seeds finished, a closed form's single fit, and for each other one what became of it."""
+    retrained, failed = [], {}
+    retrainings = run.retrainings()
+    for finalist in finalists:
+        if finalist not in retrainings:
+            raise DataError(f"{run.path}: no retraining of {finalist!r} in finalists/; restore it, or run it again.")
+        records = retrainings[finalist]
+        lost = [record for record in records if record.outcome != "completed"]
+        wanted = 1 if records[0].is_closed_form else num_seeds
+        if lost or len(records) < wanted:
+            ends = [f"{record.id} {record.outcome} {record.reason}".strip() for record in lost]
+            failed[finalist] = "; ".join(ends) or f"only {len(records)} of {wanted} seeds were trained"
+        else:
+            folders = [run.finalist(finalist, record.config["init_seed"]).checkpoint for record in records]
+            retrained.append(Retrained(id=finalist, records=records, checkpoints=folders))
+    return retrained, failed
+
+
+def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> tuple[dict, np.ndarray]:
+    """Errors of a finalist on a split, over its seeds.
+
+    Args:
+        finalist: The finalist.
+        samples: Frames of the split.
+        frames_per_block: Frames of a unit where the split has a single trajectory.
+
+    Returns:
+        What stands in summary.json, and the errors of each seed and unit (seeds, units).
+    """
+    errors = [frame_errors(load_model(checkpoint), samples) for checkpoint in finalist.checkpoints]
+    by_seed = [normalized_mse(seed) for seed in errors]
+    per_frame = [per_frame_normalized_mse(seed) for seed in errors]
+    units = np.stack([blocks_of_errors(seed, frames_per_block) for seed in errors])
+    mean = float(np.mean(by_seed))
+    interval = crossed_interval(units)
+    facts = {
+        "normalized_mse": mean,
+        "relative_rmse": math.sqrt(mean),
+        "per_frame_normalized_mse": None if None in per_frame else float(np.mean(per_frame)),
+        "ci95": None if interval is None else [min(interval[0], mean), max(interval[1], mean)],
+        "why_no_interval": why_no_interval(*units.shape),
+        "by_seed": dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
+        "units": {"count": units.shape[1], "worst": float(units.mean(axis=0).max())},
+    }
+    return facts, units
+
+
+def finalist_entry(
+    finalist: Retrained, valid: Mapping, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder
+) -> dict:
+    """A finalist's entry in summary.json."""
+    config = finalist.records[0].config
+    return {
+        "id": finalist.id,
+        "config": {"network": config["network"], "training": config["training"], "parameters": config["parameters"]},
+        "num_parameters": config["num_parameters"],
+        "updates": config["training"]["updates"],
+        "fall_at_the_end": fall_at_the_end(finalist.records),
+        "valid": dict(valid),
+        "test": dict(test),
+        "cost": asdict(cost),
+        "stability": dict(stability),
+        "checkpoint": str(finalist.best_checkpoint.relative_to(run.path)),
+        "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
+    }
+
+
+def complete_cards(finalist: Retrained, test: Mapping, environment: Mapping) -> None:
+    """Add test errors and provenance to the card beside each of a finalist's models."""
+    for record, folder in zip(finalist.records, finalist.checkpoints, strict=True):
+        own = {"normalized_mse": test["by_seed"][record.id]}
+        card = read_card(folder) | {
+            "finalist": finalist.id,
+            "test": own | {"mean_over_seeds": test["normalized_mse"], "ci95": test["ci95"]},
+            "data_sha256": environment["data"]["sha256"],
+            "git_commit": environment["git_commit"],
+        }
+        save_model(load_model(folder), folder, card)

@@ -1,0 +1,312 @@
+"""The select stage: one finalist chosen by validation, time and stability, all tested, and the study summed up."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import islice
+
+import numpy as np
+
+from cconv.data.splits import evenly_spaced
+from cconv.data.targets import Sample
+from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
+from cconv.evaluation.explanation import error_distribution, explain
+from cconv.evaluation.probes import make_probes
+from cconv.evaluation.stability import ModelPredictor, measure_stability
+from cconv.models.checkpoint import load_model
+from cconv.models.errors import mean_predictor_error, normalized_mse
+from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.study.declared.stage_tables import BASELINE, reads_of
+from cconv.study.evidence.budget import budget_words
+from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
+from cconv.study.evidence.recommendation import Recommendation, recommend, retrained_error
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.records.rungs import RungFile
+from cconv.study.records.trials import count_outcomes
+from cconv.study.running.counted_costs import points_of_search
+from cconv.study.running.problem import Problem, study_samples
+from cconv.study.stages.finalists import (
+    Retrained,
+    check_any_finished,
+    complete_cards,
+    evaluate_finalist,
+    finalist_entry,
+    retrained_finalists,
+)
+from cconv.study.stages.session import Session
+
+TIMED_FRAMES = 5
+GROWTH_REPEATS = 3
+
+
+def select(session: Session, stage: str) -> dict:
+    """Choose a finalist by validation errors, time and stability; then read the test split, once; write summary.json.
+
+    Raises:
+        StudyError: If no finalist could be retrained.
+    """
+    start = time.perf_counter()
+    study, run = session.study, session.run
+    finalists, failed = _finalists(session, stage)
+    check_any_finished(run, finalists, failed)
+    judged = _judge(session, finalists)
+    growth = _growth(session, finalists)
+    samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
+    tests, test_errors = _errors(session, finalists, samples, "test errors")
+    _explain(run, [each for each in finalists if each.id in (BASELINE, judged.chosen.id)], samples)
+    environment = run.read("environment.json")
+    for finalist in finalists:
+        complete_cards(finalist, tests[finalist.id], environment)
+    trivial, found = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
+    entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
+    summary = {
+        "study": study.name,
+        "task": study.task,
+        "dataset": _dataset(session, samples),
+        "baseline": BASELINE,
+        "mean_predictor": trivial,
+        "finalists": entries,
+        "budget": budget_words(entries, found.get("convergence", {}), study.selection.margin),
+        "failed_finalists": failed,
+        "pareto_front": timed_front({name: float(np.mean(e)) for name, e in judged.errors.items()}, judged.times),
+        "front": _front(test_errors, judged.times, trivial["test"]),
+        "recommended": {"id": judged.chosen.id, "reason": judged.chosen.reason},
+        "selection": _selection(judged, test_errors, study.selection.margin),
+        **points_of_search(session.count_cost, run.trials(), judged.costs),
+        "analytic": asdict(judged.analytic),
+        "growth": growth,
+        "trials": _counts(run),
+        "rungs": _passed_rungs(session),
+        **found,
+        "wall_seconds": _seconds_before(session, stage) + time.perf_counter() - start,
+    }
+    run.write("summary.json", summary)
+    return {"recommended": judged.chosen.id}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """What the finalists are chosen by, none of it from the test split.
+
+    Attributes:
+        facts: Validation errors of each, as they stand in the summary.
+        errors: The same by (seeds, units).
+        costs: Cost of each, and of some trials.
+        analytic: Cost of the analytic field, timed in turn with them.
+        times: Time of each.
+        stability: Checks of each.
+        choose: Validation errors of the finalists to a recommendation.
+        chosen: The recommendation by all seeds.
+    """
+
+    facts: dict[str, dict]
+    errors: dict[str, np.ndarray]
+    costs: dict[str, Cost]
+    analytic: AnalyticCost
+    times: dict[str, Timing]
+    stability: dict[str, dict]
+    choose: Callable[[Mapping[str, np.ndarray]], Recommendation]
+    chosen: Recommendation
+
+
+def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
+    settings = session.study.selection
+    facts, errors = _errors(session, finalists, session.problem.valid_samples, "validation errors")
+    (costs, analytic), stability = _time(session, finalists), _stress(session, finalists)
+    times = {name: Timing(costs[name].turns_ms) for name in facts}
+    choose = partial(
+        recommend,
+        times=times,
+        failures={name: checks["failures"] for name, checks in stability.items()},
+        accurate_enough=settings.accurate_enough,
+        margin=settings.margin,
+    )
+    return _Judged(
+        facts=facts,
+        errors=errors,
+        costs=costs,
+        analytic=analytic,
+        times=times,
+        stability=stability,
+        choose=choose,
+        chosen=choose(errors),
+    )
+
+
+def _entry(finalist: Retrained, judged: _Judged, test: Mapping, run: RunFolder) -> dict:
+    facts, cost, stability = (each[finalist.id] for each in (judged.facts, judged.costs, judged.stability))
+    return finalist_entry(finalist, facts, test, cost, stability, run)
+
+
+def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str, str]]:
+    ids = [each for name in reads_of(session.study.stages, stage) for each in session.run.result(name)["finalists"]]
+    return retrained_finalists(session.run, ids, session.study.finalists.seeds)
+
+
+def _errors(
+    session: Session, finalists: Sequence[Retrained], samples: Sequence[Sample], label: str
+) -> tuple[dict[str, dict], dict[str, np.ndarray]]:
+    """Errors of each finalist on a split, as facts and by (seeds, units)."""
+    frames = session.study.finalists.frames_per_block
+    both = {each.id: evaluate_finalist(each, samples, frames) for each in session.progress(finalists, label)}
+    return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
+
+
+def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> dict[str, float]:
+    """What a model must be below on each split to know anything: the error of predicting the training mean there."""
+    train, splits = session.problem.train_samples, {"valid": session.problem.valid_samples, "test": test_samples}
+    return {split: normalized_mse(mean_predictor_error(samples, train)) for split, samples in splits.items()}
+
+
+def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
+    """Time of the finalists, of some trials from the cheapest to the costliest, and of the analytic field, in turn."""
+    settings, run, problem = session.study.cost, session.run, session.problem
+    checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
+    trials = [record for record in run.trials() if record.last is not None and record.id not in checkpoints]
+    trials.sort(key=lambda record: record.config["flops_per_particle"])
+    chosen = [trials[place] for place in evenly_spaced(len(trials), settings.trials)] if trials else []
+    checkpoints |= {record.id: run.trial(record.id).checkpoint for record in chosen}
+    frames = list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
+    return measure_costs(
+        checkpoints,
+        load_model,
+        frames,
+        session.dataset.scene,
+        task=problem.task,
+        kernel=_kernel(problem),
+        threads=settings.threads,
+        repeats=settings.repeats,
+    )
+
+
+def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
+    """Time of the finalists and of the analytic field on blocks of fluid of growing size."""
+    settings = session.study.cost
+    checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
+    sizes = settings.sizes
+    grown = measure_growth(
+        checkpoints,
+        load_model,
+        analytic=load_model(finalists[0].best_checkpoint).config,
+        sizes=sizes,
+        threads=settings.threads,
+        repeats=GROWTH_REPEATS,
+    )
+    return {
+        "sizes": list(sizes),
+        "models": {name: [asdict(time) for time in growth.times] for name, growth in grown.items()},
+        "exponents": {name: growth.exponent for name, growth in grown.items() if math.isfinite(growth.exponent)},
+        "left_out": {name: list(growth.left_out) for name, growth in grown.items() if growth.left_out},
+    }
+
+
+def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]:
+    """Stability of every seed on validation trajectories; the test split is only looked at for its errors."""
+    problem, scene = session.problem, session.dataset.scene
+    trajectories = list(session.dataset.trajectories("valid"))
+    reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
+    probes = make_probes(trajectories, scene, problem.task, _kernel(problem), reach)
+    return {
+        finalist.id: measure_stability(
+            {
+                record.id: ModelPredictor(load_model(checkpoint))
+                for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True)
+            },
+            probes,
+        )
+        for finalist in session.progress(finalists, "stability")
+    }
+
+
+def _kernel(problem: Problem) -> AbstractKernel:
+    return kernel_named(problem.kernel)(problem.smoothing_length, problem.scene.dim)
+
+
+def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
+    """Save filters, a predicted test frame and the distribution of errors of some finalists, for the report."""
+    folder = run.path / "explanation"
+    folder.mkdir(exist_ok=True)
+    first = [sample for sample in samples if sample.trajectory == samples[0].trajectory]
+    frame = first[len(first) // 2]  # that of the start may be at rest
+    for finalist in finalists:
+        model = load_model(finalist.best_checkpoint)
+        arrays = explain(model, frame) | error_distribution(model, samples)
+        np.savez_compressed(folder / f"{finalist.id}.npz", **arrays)
+
+
+def _selection(judged: _Judged, test_errors: Mapping[str, np.ndarray], margin: float) -> dict:
+    chosen = judged.chosen
+    comparisons = [
+        {
+            "id": each.id,
+            "error": each.error,
+            "ms_per_frame": each.time.ms,
+            "ratio": each.to_best.ratio,
+            "log_standard_error": each.to_best.log_standard_error,
+            "ci95": each.to_best.ci95,
+            "within_one_se": each.within_one_se,
+            "non_inferior": each.non_inferior,
+            "accurate_enough": each.accurate_enough,
+            "stable": each.stable,
+            "eligible": each.eligible,
+            "why_not": each.why_not,
+        }
+        for each in chosen.comparisons
+    ]
+    return {
+        "units": next(iter(judged.errors.values())).shape[1],
+        "margin": margin,
+        "best": chosen.best,
+        "tied": list(chosen.tied),
+        "by_rule": chosen.by_rule,
+        "comparisons": comparisons,
+        "retrained": retrained_error(judged.errors, test_errors, lambda errors: judged.choose(errors).id),
+    }
+
+
+def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst: float) -> dict:
+    """Test errors: attainment band over seeds, and the hypervolume up to the mean predictor at the slowest time."""
+    milliseconds = {name: timing.ms for name, timing in times.items()}
+    band = attainment(errors, milliseconds)
+    corner = (worst, max(milliseconds.values()))
+    area = hypervolume_interval(errors, milliseconds, corner)
+    steps = zip(band["cost"], band["median"], band["low"], band["high"], strict=True)
+    return {
+        "attainment": [dict(zip(("ms_per_frame", "median", "low", "high"), step, strict=True)) for step in steps],
+        "hypervolume": area | {"reference": [corner[1], corner[0]]},
+    }
+
+
+def _dataset(session: Session, test_samples: Sequence[Sample]) -> dict:
+    problem = session.problem
+    frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
+    return {"path": str(session.dataset.path), "scene": session.dataset.scene.name, "frames": frames}
+
+
+def _passed_rungs(session: Session) -> dict[str, list[dict]]:
+    """How many trials of each search went on from each rung."""
+    study, file = session.study, RungFile(session.run.path / "rungs.json")
+    factor = study.search.reduction_factor
+    return {stage: file.table(stage, study.rungs, factor).passed() for stage in file.read()}
+
+
+def _counts(run: RunFolder) -> dict[str, dict[str, int]]:
+    retrainings = [record for records in run.retrainings().values() for record in records]
+    return count_outcomes([*run.trials(), *retrainings])
+
+
+def _seconds_before(session: Session, stage: str) -> float:
+    names = list(session.study.stages)
+    return sum(session.run.result(name)["seconds"] for name in names[: names.index(stage)])
+
+
+def _of_earlier_stages(session: Session, stage: str) -> Mapping:
+    """What the stages before this one have found, their own parts of the summary."""
+    found: dict = {}
+    names = list(session.study.stages)
+    for name in names[: names.index(stage)]:
+        result = session.run.result(name)
+        found |= {key: value for key, value in result.items() if key not in ("kind", "seconds", "finalists", "spent")}
+    return found

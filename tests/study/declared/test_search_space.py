@@ -1,0 +1,241 @@
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from cconv.errors import ConfigError
+from cconv.evaluation.cost_model import Estimate
+from cconv.models.model import NetworkConfig
+from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
+from cconv.study.declared.search_space import check_baseline_affordable, load_space
+from cconv.study.declared.study_file import TrainingConfig, configure, load_study
+from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
+
+REPOSITORY = Path(__file__).parents[3]
+SPACES = sorted((REPOSITORY / "search_spaces").glob("*.toml"))
+
+HEAD = 'name = "mini"\ndescription = "For tests."\n'
+CHOICE = '[parameters.window]\ntype = "choice"\nvalues = ["none", "poly6"]\nbaseline = "poly6"\nreason = "r"\n'
+FLOAT = (
+    '[parameters.learning_rate]\ntype = "float"\nrange = [1e-4, 1e-2]\nscale = "log"\nbaseline = 1e-3\nreason = "r"\n'
+)
+INT = '[parameters.kernel_size]\ntype = "int"\nrange = [3, 6]\nbaseline = 4\nreason = "r"\n'
+
+
+BASIS = '[parameters.basis]\ntype = "choice"\nvalues = ["grid", "radial"]\nbaseline = "grid"\nreason = "r"\n'
+SKIP = (
+    '[parameters.skip]\ntype = "choice"\nvalues = ["after_activation"]\nbaseline = "after_activation"\nreason = "r"\n'
+)
+OF_GRID = 'when = { basis = ["grid"] }\n'
+
+
+@pytest.fixture
+def space_file(tmp_path):
+    def write(text):
+        path = tmp_path / "space.toml"
+        path.write_text(HEAD + text)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("path", SPACES, ids=lambda path: path.stem)
+def test_every_space_of_the_repository_loads_and_explains_itself(path):
+    space = load_space(path)
+    assert all(len(parameter.reason) > 5 for parameter in space.parameters.values())
+    configure(space.baseline, NetworkConfig(), TrainingConfig())
+
+
+@pytest.mark.parametrize("name", ["density", "thesis_initial", "thesis_random", "thesis_bayesian"])
+def test_the_baseline_is_the_published_network_and_training(name):
+    space = load_space(next(path for path in SPACES if path.stem == name))
+    network, training = configure(space.baseline, NetworkConfig(), TrainingConfig())
+    assert network == NetworkConfig()
+    assert training == TrainingConfig()
+
+
+def conditional_space():
+    """Kernel size on the grid only; mapping only for the larger two; terms on the radial basis only."""
+    parameters = {
+        "mapping": {"values": ["identity", "ball_to_cube_radial"], "when": {"kernel_size": [4, 5]}},
+        "kernel_size": {"type": "int", "range": [3, 5], "baseline": 4, "when": {"basis": ["grid"]}},
+        "basis": {"values": ["grid", "radial"]},
+        "radial_terms": {"values": [8, 16], "when": {"basis": ["radial"]}},
+        "window": {"values": ["none", "poly6"], "when": {"basis": ["grid"], "layers": [2]}},
+        "layers": {"values": [1, 2]},
+    }
+    for parameter in parameters.values():
+        parameter.setdefault("type", "choice")
+        parameter.setdefault("baseline", parameter.get("values", [None])[0])
+        parameter["reason"] = "r"
+    return SearchSpace.model_validate({"name": "c", "description": "d", "parameters": parameters})
+
+
+ALL = {"mapping": "identity", "kernel_size": 4, "basis": "grid", "radial_terms": 8, "window": "none", "layers": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "active"),
+    [
+        ({}, {"mapping", "kernel_size", "basis", "window", "layers"}),
+        ({"kernel_size": 3}, {"kernel_size", "basis", "window", "layers"}),
+        ({"layers": 1}, {"mapping", "kernel_size", "basis", "layers"}),
+        ({"basis": "radial"}, {"basis", "radial_terms", "layers"}),
+    ],
+)
+def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
+    space, values = conditional_space(), ALL | changes
+    assert space.active(values) == {name: values[name] for name in values if name in active}
+    assert space.active(space.active(values)) == space.active(values)
+
+
+def test_parents_come_before_those_that_depend_on_them():
+    order = conditional_space().parents_first
+    assert sorted(order) == sorted(ALL)
+    assert order.index("basis") < order.index("kernel_size") < order.index("mapping")
+
+
+def test_the_baseline_holds_active_parameters_only():
+    assert conditional_space().baseline == {"mapping": "identity", "kernel_size": 4, "basis": "grid", "layers": 1}
+
+
+def test_a_configuration_is_whole_and_in_its_domain():
+    space = conditional_space()
+    whole = space.active(ALL)
+    assert space.holds(whole)
+    assert space.holds({"basis": "radial", "radial_terms": 8, "layers": 1})
+    missing = {name: value for name, value in whole.items() if name != "mapping"}
+    for wrong in (ALL, missing, whole | {"kernel_size": 7}, whole | {"learning_rate": 1e-3}):
+        assert not space.holds(wrong)
+
+
+def test_conditions_follow_a_narrower_domain():
+    space = conditional_space()
+    small = narrowed(space, {"kernel_size": space.parameters["kernel_size"].model_copy(update={"range": (3, 4)})})
+    assert small.parameters["mapping"].when == {"kernel_size": [4]}
+    grid = Choice(type="choice", values=["grid"], baseline="grid", reason="r")
+    assert narrowed(space, {"basis": grid}).parameters.keys() == ALL.keys() - {"radial_terms"}
+
+
+def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
+    space = fixed(conditional_space(), "layers")
+    assert space.parameters["layers"].values == [1]
+    assert "window" not in space.parameters
+    assert space.baseline == conditional_space().baseline
+    assert fixed(space, "boundary") == space
+
+
+def test_single_layers_hold_what_is_active_in_one():
+    layers = single_layers(conditional_space(), NetworkConfig(), 3)
+    grid = [layer for layer in layers if layer["basis"] == "grid"]
+    assert [layer for layer in grid if layer["kernel_size"] == 3] == [{"layers": 1, "basis": "grid", "kernel_size": 3}]
+    assert all(
+        set(layer) == {"layers", "basis", "kernel_size", "mapping"} for layer in grid if layer["kernel_size"] > 3
+    )
+    assert len(grid) == 1 + 2 * 2  # no window: it takes two layers
+    radial = [layer for layer in layers if layer["basis"] == "radial"]
+    assert radial == [{"layers": 1, "basis": "radial", "radial_terms": terms} for terms in (8, 16)]
+
+
+def test_single_layers_of_the_density_space_are_distinct_configurations_with_all_switches():
+    space = load_space(next(path for path in SPACES if path.stem == "density"))
+    layers = single_layers(space, NetworkConfig(), 2)
+    assert len({repr(sorted(layer.items())) for layer in layers}) == len(layers)
+    assert all(space.holds(layer | {"learning_rate": 1e-3}) for layer in layers)
+    assert {(layer["boundary"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
+
+
+def test_a_baseline_above_the_cap_is_refused():
+    space = conditional_space().model_copy(update={"max_flops_per_particle": 2e6})
+    check_baseline_affordable(space, lambda parameters: costing(1e6 if parameters == space.baseline else 3e6))
+    check_baseline_affordable(conditional_space(), lambda parameters: costing(1e9))
+    with pytest.raises(ConfigError, match=r"'c': its baseline costs 3e\+06 flops .* `max_flops_per_particle` = 2e"):
+        check_baseline_affordable(space, lambda parameters: costing(3e6))
+    space = conditional_space().model_copy(update={"max_bytes_per_particle": 1e3})
+    with pytest.raises(ConfigError, match="costs 2e.03 bytes per particle .* `max_bytes_per_particle` = 1e"):
+        check_baseline_affordable(space, lambda parameters: costing(3e6))
+
+
+def costing(flops):
+    return Estimate(flops_per_particle=flops, bytes_per_particle=2e3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (CHOICE.replace("window", "windw"), r"unknown hyperparameter `parameters\.windw`\. Did you mean 'window'"),
+        (CHOICE.replace("reason", "because"), "unknown key `parameters.window.because`"),
+        (CHOICE.replace('baseline = "poly6"', 'baseline = "gauss"'), "baseline 'gauss' must be one of the values"),
+        (CHOICE.replace('"none"', '"nothing"'), "`parameters.window`: the value 'nothing' is not possible"),
+        (FLOAT.replace("1e-3", "1.0"), r"baseline 1\.0 must lie in the range"),
+        (FLOAT.replace("[1e-4, 1e-2]", "[1e-2, 1e-4]"), "lower end first"),
+        (FLOAT.replace("[1e-4, 1e-2]", "[0.0, 1e-2]"), "positive on a log scale"),
+        (INT.replace("[3, 6]", "[0, 6]"), "the value 0 is not possible"),
+        (INT.replace('"int"', '"integer"'), "parameters.kernel_size"),
+        ("", "`parameters` is missing"),
+        ("max_flops_per_particle = 0.0\n" + CHOICE, "`max_flops_per_particle`: input should be greater than 0"),
+        (INT + OF_GRID, r"`parameters\.kernel_size\.when\.basis`: names no parameter of the space"),
+        (INT + 'when = { bases = ["grid"] }\n' + BASIS, r"Did you mean 'basis'"),
+        (
+            INT + 'when = { basis = ["gird"] }\n' + BASIS,
+            r"basis`: lists 'gird', which is not in the domain of 'basis'",
+        ),
+        (
+            INT + "when = { basis = [] }\n" + BASIS,
+            r"`parameters\.kernel_size\.when\.basis`: list should have",
+        ),
+        (CHOICE + "when = { kernel_size = [7] }\n" + INT, r"when\.kernel_size`: lists 7, which is not in the domain"),
+        (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
+        (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
+        (BASIS.replace('= "grid"', '= "radial"') + SKIP, r"the baseline is not possible .*skip 'after_activation'"),
+        (FLOAT.replace("1e-2]", "inf]"), r"`parameters\.learning_rate\.range\.1`: input should be a finite number"),
+        (FLOAT.replace("1e-4", "1e-300"), r"the value 1e-300 is not possible"),
+        (
+            INT.replace("= 4", "= true"),
+            r"`parameters\.kernel_size\.baseline`: input should be a valid integer, got True",
+        ),
+        (INT.replace("[3, 6]", "[3, 100000000000]"), r"range\.1`: input should be less than or equal to 1000000000"),
+        (CHOICE.replace('["none",', "[nan,"), r"`parameters\.window\.values\.0`: must be true, false, a number"),
+        (CHOICE.replace('"none"', ", ".join(f'"{n}"' for n in range(200))), "list should have at most 100 items"),
+        ("max_flops_per_particle = inf\n" + CHOICE, "`max_flops_per_particle`: input should be a finite number"),
+        (CHOICE.replace('"r"', '"\\u001b[2J"'), "`parameters.window.reason`: a text must hold no control characters"),
+        ("x." * 100_000 + "x = 1\n" + CHOICE, "a key has more than 32 parts"),
+    ],
+)
+def test_what_does_not_fit_is_named(text, message, space_file):
+    with pytest.raises(ConfigError, match=message) as error:
+        load_space(space_file(text))
+    assert "space.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_true_is_no_one(space_file):
+    layers = '[parameters.layers]\ntype = "choice"\nvalues = [1, 2]\nbaseline = 1\nreason = "r"\n'
+    assert not load_space(space_file(layers)).holds({"layers": True})
+    with pytest.raises(ConfigError, match="baseline True must be one of"):
+        load_space(space_file(layers.replace("baseline = 1", "baseline = true")))
+
+
+def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
+    path = space_file(BASIS)
+    study = load_study(REPOSITORY / "experiments" / "smoke.toml", ["network.skip=after_activation"])
+    load_space(path)
+    with pytest.raises(ConfigError, match="`parameters.basis`: the value 'radial' is not possible .*after_activation"):
+        load_space(path, study)
+
+
+def test_layers_of_a_huge_space_are_drawn_without_listing_them():
+    """2e13 layers, of which no more than a limit are ever held."""
+    choices = {"relative_cutoff": [1.5 + number / 100 for number in range(100)], "radial_terms": list(range(1, 101))}
+    for name in ("window", "mapping", "interpolation", "message", "normalize"):
+        choices[name] = [f"{name}{number}" for number in range(50)]
+    parameters = {
+        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "r"}
+        for name, values in choices.items()
+    }
+    space = SearchSpace.model_validate({"name": "huge", "description": "d", "parameters": parameters})
+    network = NetworkConfig(basis="radial")
+    layers = single_layers(space, network, 3)
+    assert 1000 < len(layers) <= MOST_LAYERS
+    assert {layer["relative_cutoff"] for layer in layers} == set(choices["relative_cutoff"])
+    assert layers == single_layers(space, network, 3)

@@ -1,0 +1,72 @@
+"""Stages that read what is not there are refused, with the nearest name; what reads what follows from their order."""
+
+import pytest
+
+from cconv.errors import ConfigError
+from cconv.study.declared.stage_tables import default_stages, readers_of, reads_of
+from cconv.study.declared.study_file import StudyConfig
+from cconv.validation import validated
+
+SEARCH = {"space": "space.toml"}
+
+
+def study(**stages):
+    return validated(StudyConfig, {"name": "s", "task": "density_rate", "search": SEARCH, "stages": stages}, "s.toml")
+
+
+def test_a_stage_has_the_kind_of_its_name_unless_it_says_otherwise():
+    stages = study(random={}, second={"kind": "random", "trials": 3}).stages
+    assert [stage.kind for stage in stages.values()] == ["random", "random"]
+    assert list(stages) == ["random", "second"]
+
+
+def test_a_stage_reads_all_earlier_ones_that_it_can_use_or_those_it_names():
+    stages = study(
+        closed_form={}, random={}, second={"kind": "random"}, refine={}, adaptive={"reads": ["second"]}, finalists={}
+    ).stages
+    assert reads_of(stages, "refine") == ["random", "second"]
+    assert reads_of(stages, "adaptive") == ["second"]
+    assert reads_of(stages, "finalists") == ["closed_form", "random", "second", "adaptive"]
+
+
+def test_more_trials_reach_every_stage_that_reads_them_directly_or_not():
+    stages = study(closed_form={}, random={}, refine={}, adaptive={"space": "refine"}, finalists={}, select={}).stages
+    assert readers_of(stages, "random") == {"refine", "adaptive", "finalists", "select"}
+    assert readers_of(stages, "adaptive") == {"finalists", "select"}
+
+
+def test_the_default_stages_read_earlier_ones():
+    assert study(**{name: stage.model_dump() for name, stage in default_stages().items()}).stages == default_stages()
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ({"random": {}, "finalists": {"reads": ["randm"]}}, "`finalists` names `randm`.*Did you mean 'random'"),
+        ({"finalists": {"reads": ["random"]}, "random": {}}, "no stage before it"),
+        ({"random": {}, "adaptive": {"space": "refine"}}, "`adaptive` names `refine`"),
+        ({"random": {}, "adaptive": {"space": "random"}}, "no stage of kind refine"),
+        ({"random": {}, "select": {}}, "`select` has nothing to read; put one of finalists"),
+        ({"closed_form": {}, "refine": {"reads": ["closed_form"]}}, "cannot use the records of `closed_form`"),
+        ({"random": {"trails": 3}}, "unknown key `stages.random.*trails`"),
+        ({"rondom": {}}, "stages.rondom"),
+        ({}, "stages"),
+    ],
+)
+def test_what_does_not_fit_is_named(stages, message):
+    with pytest.raises(ConfigError, match=message):
+        study(**stages)
+
+
+def test_a_stage_that_converges_names_finalists_that_are_sure_to_be_there():
+    stages = {"random": {}, "finalists": {"include": {"named": {"layers": 1}}}}
+    named = study(**stages, converge={"budgets": [10, 20], "of": ["baseline", "named"]}, select={}).stages
+    assert reads_of(named, "select") == ["finalists", "converge"]
+    with pytest.raises(ConfigError, match="names the finalist `random_0001`; it can name baseline, named"):
+        study(**stages, converge={"budgets": [10], "of": ["random_0001"]})
+
+
+@pytest.mark.parametrize("budgets", [[20, 10], [10, 10], [], [0, 5]])
+def test_budgets_ascend(budgets):
+    with pytest.raises(ConfigError, match="budgets"):
+        study(random={}, finalists={}, converge={"budgets": budgets})

@@ -1,0 +1,33 @@
+"""The select stage asks every seed of a finalist whether it is stable."""
+
+from types import SimpleNamespace
+
+import torch
+from systems import periodic_scene, periodic_trajectory, problem
+
+from cconv.models.checkpoint import save_model
+from cconv.models.model import NetworkConfig
+from cconv.study.stages.finalists import Retrained
+from cconv.study.stages.select import _stress
+
+
+def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
+    """One of two seeds predicts no numbers, and not the best one; the failures name it."""
+    given = problem(generator)
+    for seed in (1, 2):
+        model = given.build_model(NetworkConfig(layers=1, kernel_size=3), seed)
+        if seed == 2:
+            torch.nn.init.constant_(next(model.parameters()), 3e38)  # no file may hold nan
+        save_model(model, tmp_path / str(seed), {})
+    records = [SimpleNamespace(id=f"baseline/seed_{seed}", best=0.1 * seed) for seed in (1, 2)]
+    finalist = Retrained(id="baseline", records=records, checkpoints=[tmp_path / "1", tmp_path / "2"])
+    session = SimpleNamespace(
+        problem=given,
+        dataset=SimpleNamespace(scene=periodic_scene(), trajectories=lambda split: [periodic_trajectory(generator)]),
+        progress=lambda items, label: items,
+    )
+    checks = _stress(session, [finalist])["baseline"]
+    assert checks["counts"]["seeds"] == 2
+    precise = [line for line in checks["failures"] if "float32" in line]
+    assert len(precise) == 1
+    assert "seeds baseline/seed_2 of 2" in precise[0]

@@ -1,0 +1,31 @@
+"""Seeds of the stages: each has a stream of its own, which nothing but the study's search seed and its name decide."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from conftest import SMOKE
+
+from cconv.study.declared.study_file import load_study
+from cconv.study.stages.session import Session
+
+
+def session_of(*settings):
+    return Session(**dict.fromkeys(field.name for field in fields(Session)) | {"study": load_study(SMOKE, settings)})
+
+
+@pytest.mark.parametrize(
+    "settings", [["seeds.data=7"], ["seeds.init=7"], ["stages.random.trials=9"], ["training.updates=500"]]
+)
+def test_no_other_seed_and_no_other_stage_shifts_the_draws_of_a_stage(settings):
+    changed, known = session_of(*settings), session_of()
+    assert all(changed.seed_of(stage) == known.seed_of(stage) for stage in known.study.stages)
+
+
+def test_streams_of_stages_and_studies_never_overlap():
+    sessions = [session_of(f"seeds.search={seed}") for seed in range(20)]
+    names = [*sessions[0].study.stages, "random_2", "2_random"]
+    seeds = [session.seed_of(name) for session in sessions for name in names]
+    draws = {tuple(np.random.default_rng(seed).integers(2**63, size=2)) for seed in seeds}
+    assert len(draws) == len(sessions) * len(names)
+    assert all(0 <= seed < 2**32 for seed in seeds)  # what every sampler takes
