@@ -52,7 +52,7 @@ def whole_summary(summary: dict) -> dict:
                 "valid_normalized_mse": 0.002,
                 "of": 0.001,
                 "flops_per_particle": 900.0,
-                "parameters": {"boundary": True},
+                "parameters": {"walls": True},
             },
             {"left_out": "density", "valid_normalized_mse": None, "of": 0.001, "flops_per_particle": None},
         ],

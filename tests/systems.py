@@ -4,11 +4,15 @@ import math
 
 import torch
 
-from cconv.data.targets import Sample, make_sample
 from cconv.data.trajectory import Boundary, Frame, Scene, Trajectory
 from cconv.domain import Box
+from cconv.models.model import Model, build_model
+from cconv.networks import ARCHITECTURES
 from cconv.sph.kernels import CubicSpline
+from cconv.study.declared.configuration import DEFAULTS, Configuration, configure
 from cconv.study.running.problem import Problem
+from cconv.tasks import task_named
+from cconv.tasks.samples import Sample, make_sample
 
 
 def periodic_scene(particles_per_side: int = 8) -> Scene:
@@ -83,7 +87,7 @@ def samples(generator: torch.Generator, count: int, task: str = "density_rate", 
     """Samples of independent frames of the periodic scene."""
     scene = periodic_scene()
     return [
-        make_sample(periodic_frame(generator), scene, task, kernel(scene), trajectory, index) for index in range(count)
+        make_sample(periodic_frame(generator), scene, task_named(task), trajectory, index) for index in range(count)
     ]
 
 
@@ -92,9 +96,30 @@ def problem(generator: torch.Generator, task: str = "density_rate") -> Problem:
     scene = periodic_scene()
     return Problem(
         scene=scene,
-        task=task,
-        kernel="cubic_spline",
-        smoothing_length=scene.particle_spacing,
+        task=task_named(task),
         train_samples=samples(generator, 4, task, "train"),
         valid_samples=samples(generator, 2, task, "valid"),
     )
+
+
+def configured(**parameters) -> Configuration:
+    """The published network with all features, and some hyperparameters in place of its own.
+
+    Those of another architecture are left out, so that one call serves all architectures.
+    """
+    architecture = parameters.get("architecture", "conv_net")
+    foreign = {name for settings in ARCHITECTURES.values() for name in settings.model_fields}
+    foreign -= {*ARCHITECTURES[architecture].model_fields}
+    return configure({name: value for name, value in parameters.items() if name not in foreign}, DEFAULTS)
+
+
+def model_of(
+    configuration: Configuration,
+    scene: Scene,
+    task: str,
+    train_samples: list[Sample],
+    generator: torch.Generator | None = None,
+) -> Model:
+    """A fresh model of a density task."""
+    asked = task_named(task)
+    return build_model(configuration.network, asked, configuration.features, scene, train_samples, generator)

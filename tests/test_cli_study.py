@@ -40,7 +40,7 @@ def test_status_and_report_of_a_finished_run(cconv, finished_run):
 def test_fit_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
     layer = [
         setting
-        for value in ("layers=1", "basis=radial", "message=difference", "relative_cutoff=2.0")
+        for value in ("layers=1", "architecture=radial_net", "message=difference", "relative_cutoff=2.0")
         for setting in ("--set", f"network.{value}")
     ]
     command = ("fit", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *layer)

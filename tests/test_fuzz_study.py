@@ -16,11 +16,10 @@ from conftest import SMOKE
 from fuzzing import changed_bytes, changed_json, changed_toml, check_call, examples, places, values
 from hypothesis import given
 from hypothesis import strategies as st
-from systems import problem
+from systems import configured, problem
 from torch import Generator
 
 from cconv.models.checkpoint import save_model
-from cconv.models.model import NetworkConfig
 from cconv.study.declared.search_space import load_space
 from cconv.study.declared.study_file import load_study
 from cconv.study.pipeline import begin_study
@@ -59,7 +58,7 @@ def material(tmp_path_factory, flow_folder):
     run.write("rungs.json", {"random": [{"updates": 6, "recorded": {"random_0000": 0.5}}]})
     run.write("stages/random.json", {"kind": "random", "seconds": 1.0})
     given_problem = problem(Generator().manual_seed(0))
-    model = given_problem.build_model(NetworkConfig(layers=1, kernel_size=3, relative_cutoff=1.5), 0)
+    model = given_problem.build_model(configured(layers=1, kernel_size=3, relative_cutoff=1.5), 0)
     save_model(model, folder / "checkpoint", provenance(study) | {"data_seed": 0})
     return folder
 

@@ -18,6 +18,7 @@ TIERS = [
     {"nn"},
     {"networks", "scenes"},
     {"data"},
+    {"tasks"},
     {"models"},
     {"evaluation", "training"},
     {"study"},
@@ -29,7 +30,7 @@ STUDY_TIERS = [{"declared"}, {"records"}, {"evidence", "running"}, {"stages"}, {
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 STUDY = [path for path in MODULES if path.is_relative_to(PACKAGE / "study") and path.parent != PACKAGE / "study"]
 STUDY.append(PACKAGE / "study" / "pipeline.py")
-NUMERICS = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in {"sph", "nn", "ops", "networks"}]
+NUMERICS = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in {"sph", "nn", "ops"}]
 
 
 def parts(path):

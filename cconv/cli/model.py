@@ -36,7 +36,7 @@ def train(
     try:
         with TrainingBar(errors, config.name, config.training.updates) as bar:
             trial = run_trial(
-                problem, {}, config.network, config.training, folder, stage="train", init_seed=config.seeds.init,
+                problem, {}, config.configuration, folder, stage="train", init_seed=config.seeds.init,
                 data_seed=config.seeds.data, provenance=provenance(config, dataset), on_update=bar.on_update,
             )  # fmt: skip
             entries = list(trial)
@@ -67,8 +67,9 @@ def fit(
 ) -> None:
     """Fit a single layer to a study's data in closed form: seconds, no training.
 
-    The study's table network says which layer, e.g. experiments/closed_form.toml: layers = 1, basis = "radial" or
-    "grid", message, relative_cutoff, window. The checkpoint evaluates like a trained one (`cconv evaluate DIR`).
+    The study's table network says which layer, e.g. experiments/closed_form.toml: layers = 1, architecture =
+    "radial_net" or "conv_net", message, relative_cutoff, window. The checkpoint evaluates like a trained one
+    (`cconv evaluate DIR`).
     """
     from cconv.models.checkpoint import save_model
     from cconv.models.closed_form import solve_closed_form
@@ -78,11 +79,12 @@ def fit(
 
     check_setting(Ridge, ridge, "--ridge")
     config, problem, dataset = _study_and_problem(study, data, settings, out)
-    model = problem.build_model(config.network, config.seeds.init)
+    model = problem.build_model(config.configuration, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
     error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
     card = {
         "stage": "closed_form",
+        "features": list(model.config.features),
         "network": config.network.model_dump(),
         "ridge": ridge,
         "data_seed": config.seeds.data,
@@ -119,9 +121,9 @@ def evaluate(
     Models know no units of the data, so that other data may have another resolution. Their masses, spacing and time are
     their own, or given here; those of the checkpoint are only for the data that it was trained on.
     """
-    from cconv.data.targets import iterate_samples
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
+    from cconv.tasks.samples import iterate_samples
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
     given = {
@@ -131,11 +133,10 @@ def evaluate(
         "force": None if force is None else parse_vector(force),
     }
     dataset, is_own = open_card_data(card, data, given)
-    kernel = model.kernel_at(dataset.scene.particle_spacing)
 
     def samples(split: str, verb: str) -> list:
         label = f"{verb} {split}"
-        return list(show_progress(iterate_samples(dataset, split, model.config.task, kernel), label))
+        return list(show_progress(iterate_samples(dataset, split, model.task), label))
 
     asked = samples(split, "read")
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import torch
 
-from cconv.data.features import Inputs, inputs_without_density
-from cconv.data.targets import VECTOR_TASKS
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.domain import Box
-from cconv.evaluation.cost_model import Surroundings, estimate
 from cconv.evaluation.memory import peak_megabytes
-from cconv.models.model import FieldConfig, FieldModel
+from cconv.models.model import Model, ModelConfig
 from cconv.neighbors import radius_graph
+from cconv.networks.counting import NeighborDensity
 from cconv.sph.compiled import CompiledSums
-from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.tasks import task_named
+from cconv.tasks.features import FluidState, Inputs
+from cconv.tasks.task import FieldTask
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
 
@@ -89,12 +89,11 @@ class AnalyticCost:
 
 def measure_costs(
     models: Mapping[str, Path],
-    load: Callable[[Path], FieldModel],
+    load: Callable[[Path], Model],
     frames: Sequence[Frame],
     scene: Scene,
     *,
-    task: str,
-    kernel: AbstractKernel,
+    task: FieldTask,
     threads: int,
     repeats: int,
 ) -> tuple[dict[str, Cost], AnalyticCost]:
@@ -108,14 +107,13 @@ def measure_costs(
         load: Reads a checkpoint folder.
         frames: Frames to predict, in turn.
         scene: Their scene.
-        task: Which analytic field: "density_rate" or "density_gradient".
-        kernel: SPH kernel of the analytic field.
+        task: Which analytic field.
         threads: Torch threads.
         repeats: Timed predictions of each model, at least 2.
     """
     loaded = {name: load(path) for name, path in models.items()}
     calls = {name: _model_call(model, frames, scene) for name, model in loaded.items()}
-    calls[ANALYTIC] = _analytic_call(task, kernel, frames, scene)
+    calls[ANALYTIC] = _analytic_call(task, frames, scene)
     with _threads(threads):
         times = _times_in_turn(calls, repeats)
     peaks = peak_megabytes(load, models, frames[0], scene, threads)
@@ -128,7 +126,7 @@ def measure_costs(
             turns_ms=_turns(times[name]),
             us_per_particle=1e3 * medians["ms_per_frame"] / max(particles, 1),
             peak_mb=peaks[name],
-            flops_per_particle=flops_per_particle(model, inputs_without_density(frames[0], scene)),
+            flops_per_particle=flops_per_particle(model, model.inputs(frames[0], scene)),
             threads=threads,
             num_particles=particles,
         )
@@ -173,9 +171,9 @@ class Growth:
 
 def measure_growth(
     models: Mapping[str, Path],
-    load: Callable[[Path], FieldModel],
+    load: Callable[[Path], Model],
     *,
-    analytic: FieldConfig | None = None,
+    analytic: ModelConfig | None = None,
     sizes: Sequence[int] = (1000, 3000, 10_000, 30_000, 100_000),
     threads: int,
     repeats: int,
@@ -214,7 +212,7 @@ def measure_growth(
     }
 
 
-def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> tuple[Frame, Scene]:
+def fluid_block(num_particles: int, field: ModelConfig, seed: int = 0) -> tuple[Frame, Scene]:
     """A cube of fluid in open space for a model: a jittered lattice with random velocities, on a layer of wall points.
 
     Args:
@@ -229,9 +227,9 @@ def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> tuple[
     lattice = torch.cartesian_prod(*[ticks] * dim).reshape(-1, dim)
     jitter = 0.2 * (torch.rand(num_particles, dim, generator=generator) - 0.5)
     boundary = None
-    if field.boundary_channels:  # below the first axis, along which the cube fills up
+    if field.walls:  # below the first axis, along which the cube fills up
         walls = lattice[: side ** (dim - 1)] - torch.eye(dim)[0]
-        normals = torch.eye(dim)[:1].expand_as(walls).clone() if field.boundary_channels == dim else None
+        normals = torch.eye(dim)[:1].expand_as(walls).clone() if field.walls.vectors else None
         boundary = Boundary(positions=spacing * walls, normals=normals)
     frame = Frame(
         positions=spacing * (lattice[:num_particles] + jitter),
@@ -243,7 +241,7 @@ def fluid_block(num_particles: int, field: FieldConfig, seed: int = 0) -> tuple[
     return frame, _block_scene(field, side)
 
 
-def _block_scene(field: FieldConfig, side: int) -> Scene:
+def _block_scene(field: ModelConfig, side: int) -> Scene:
     dim, spacing = field.dim, field.particle_spacing
     return Scene(
         name="block",
@@ -252,34 +250,29 @@ def _block_scene(field: FieldConfig, side: int) -> Scene:
         frame_dt=1.0,
         box=Box([0] * dim, [spacing * side] * dim),
         force=None,
-        has_boundary=bool(field.boundary_channels),
+        has_boundary=field.walls is not None,
         velocity_source="stored",
         mass_source="stored",
         missing=(),
     )
 
 
-def flops_per_particle(model: FieldModel, inputs: Inputs) -> float:
-    """Multiplications and additions of one particle's prediction, as `cost_model` counts them for the given frame."""
+def flops_per_particle(model: Model, inputs: Inputs) -> float:
+    """Multiplications and additions of one particle's prediction, counted from settings for the given frame."""
     config = model.config
-    return estimate(
-        config.network.model_dump(),
-        dim=config.dim,
-        vector_output=config.task in VECTOR_TASKS,
-        boundary_channels=config.boundary_channels,
-        surroundings=surroundings_of(inputs, config.network.relative_cutoff),
-    ).flops_per_particle
+    around = neighbor_density(inputs, config.network.relative_cutoff)
+    return config.network.count(config.inputs, config.walls, config.output, config.dim, around).flops_per_particle
 
 
-def surroundings_of(inputs: Inputs, relative_cutoff: float) -> Surroundings:
+def neighbor_density(inputs: Inputs, relative_cutoff: float) -> NeighborDensity:
     """Points around the particles of a frame, counted within a cutoff in particle spacings."""
     particles = max(inputs.num_particles, 1)
     counts = [len(radius_graph(inputs.positions, relative_cutoff, inputs.box)) / particles]
-    if inputs.boundary_positions is not None:
-        walls = inputs.boundary_positions
+    if inputs.wall_positions is not None:
+        walls = inputs.wall_positions
         pairs = radius_graph(walls, relative_cutoff, inputs.box, queries=inputs.positions)
         counts += [len(pairs) / particles, len(walls) / particles]
-    return Surroundings.counted(relative_cutoff, inputs.positions.shape[1], *counts)
+    return NeighborDensity.counted(relative_cutoff, inputs.dim, *counts)
 
 
 def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tuple[float, float]]]:
@@ -295,27 +288,27 @@ def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tu
     return {name: samples[1:] for name, samples in times.items()}
 
 
-def _model_call(model: FieldModel, frames: Sequence[Frame], scene: Scene) -> Call:
+def _model_call(model: Model, frames: Sequence[Frame], scene: Scene) -> Call:
     return lambda turn: _time_prediction(model, frames[turn % len(frames)], scene)
 
 
-def _analytic_call(task: str, kernel: AbstractKernel, frames: Sequence[Frame], scene: Scene) -> Call:
-    sums = CompiledSums(kernel)
+def _analytic_call(task: FieldTask, frames: Sequence[Frame], scene: Scene) -> Call:
+    sums = CompiledSums(task.kernel_at(scene.particle_spacing, scene.dim))
     return lambda turn: _time_analytic(task, sums, frames[turn % len(frames)], scene)
 
 
-def _block_call(model: FieldModel, size: int) -> Call:
+def _block_call(model: Model, size: int) -> Call:
     frame, scene = fluid_block(size, model.config)
     return _model_call(model, [frame], scene)
 
 
-def _analytic_block_call(field: FieldConfig, size: int) -> Call:
+def _analytic_block_call(field: ModelConfig, size: int) -> Call:
     frame, scene = fluid_block(size, field)
-    kernel = kernel_named(field.kernel)(field.relative_smoothing_length * field.particle_spacing, field.dim)
-    return _analytic_call(field.task, kernel, [frame], scene)
+    task = task_named(field.task, field.kernel, field.relative_smoothing_length)
+    return _analytic_call(task, [frame], scene)
 
 
-def _time_prediction(model: FieldModel, frame: Frame, scene: Scene) -> tuple[float, float]:
+def _time_prediction(model: Model, frame: Frame, scene: Scene) -> tuple[float, float]:
     """Time of `predict_frame` outside of the network and within it."""
     marks = []
     hooks = [
@@ -331,17 +324,15 @@ def _time_prediction(model: FieldModel, frame: Frame, scene: Scene) -> tuple[flo
     return total - network, network
 
 
-def _time_analytic(task: str, sums: CompiledSums, frame: Frame, scene: Scene) -> tuple[float, float]:
+def _time_analytic(task: FieldTask, sums: CompiledSums, frame: Frame, scene: Scene) -> tuple[float, float]:
     """Time of the neighbour search, fluid picked out of the frame, and of the sums."""
     start = time.perf_counter()
     fluid = frame.particle_types == ParticleType.FLUID
     masses, positions, velocities = (values[fluid] for values in (frame.masses, frame.positions, frame.velocities))
-    edges = radius_graph(positions, sums.kernel.support_radius, scene.box)
+    state = FluidState(positions=positions, velocities=velocities, masses=masses, box=scene.box, kernel=sums.kernel)
+    state.edges  # noqa: B018, searched here
     middle = time.perf_counter()
-    if task in VECTOR_TASKS:
-        sums.density_gradient(masses, sums.density(masses, edges), edges)
-    else:
-        sums.density_rate(masses, velocities, edges)
+    task.compiled_field(sums, state)
     return middle - start, time.perf_counter() - middle
 
 

@@ -10,26 +10,27 @@ radial terms count exactly as they do in a prediction.
 import math
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cconv.data.features import FluidState, Inputs, Units
-from cconv.data.targets import TASKS, VECTOR_TASKS, Sample
 from cconv.domain import Box
-from cconv.models.model import FieldModel
+from cconv.models.model import Model
 from cconv.neighbors import radius_graph
 from cconv.nn.filters import window_values
+from cconv.nn.kinds import split_kinds
 from cconv.sph.operators import density
+from cconv.tasks.features import DENSITY, VELOCITY, Features, FluidState, Inputs
+from cconv.tasks.samples import Sample
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 _POINTS_ON_LINE, _RADII, _BINS_PER_DECADE = 161, 80, 5
 
 
 @torch.no_grad()
-def explain(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
+def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
     """Fields and first-layer filters of a model on one frame; arrays that `np.savez` holds and `np.load` reads.
 
     Args:
@@ -53,7 +54,7 @@ def explain(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
 
 
 @torch.no_grad()
-def error_distribution(model: FieldModel, samples: Iterable[Sample]) -> dict[str, np.ndarray]:
+def error_distribution(model: Model, samples: Iterable[Sample]) -> dict[str, np.ndarray]:
     """How the errors of single particles are spread.
 
     An error is the root mean square over the components of prediction - target, by the standard deviation of the target
@@ -76,7 +77,7 @@ def error_distribution(model: FieldModel, samples: Iterable[Sample]) -> dict[str
 
 
 @torch.no_grad()
-def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarray]:
+def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
     """Learned filters of the fluid's first layer beside the analytic ones.
 
     A network of one layer is compared as it is. The outputs of a deeper one have no meaning of their own: its filters
@@ -95,14 +96,15 @@ def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarr
     learned = _learned_filters(model, sample, pairs)
     learned = learned @ _combination(learned[pairs.ball], analytic[pairs.ball], pairs.volume, model)
     unexplained = _unexplained(learned[pairs.ball], analytic[pairs.ball], pairs.volume)
-    per_feature = _filter_units(sample, model.config.dim)
+    per_feature = _filter_units(sample)
     learned, analytic = learned * per_feature, analytic * per_feature
-    profile = _along_direction(learned, pairs, model.config.task)
+    reads_density = bool(model.config.output.vectors)
+    profile = _along_direction(learned, pairs, sample.inputs.features, reads_density)
     length = sample.inputs.units.length
     results = {
         "is_combined": torch.tensor(len(model.network.convs) > 1),
         "unexplained": unexplained,
-        "cutoff": torch.tensor(length * model.config.network.relative_cutoff),
+        "cutoff": torch.tensor(length * model.settings.relative_cutoff),
         "support": torch.tensor(length * model.kernel_at(1.0).support_radius),
         "line": length * pairs.line,
         "learned_on_axes": _on_axes(learned, pairs),
@@ -111,10 +113,11 @@ def first_layer_filters(model: FieldModel, sample: Sample) -> dict[str, np.ndarr
         "learned_radial": profile.mean(dim=1),
         "learned_radial_low": profile.quantile(0.05, dim=1),
         "learned_radial_high": profile.quantile(0.95, dim=1),
-        "analytic_radial": _along_direction(analytic, pairs, model.config.task)[:, 0],
+        "analytic_radial": _along_direction(analytic, pairs, sample.inputs.features, reads_density)[:, 0],
     }
-    names = ["1", *(f"v_{axis}" for axis in "xyz"[: model.config.dim]), "ρ"]
-    return {"feature_names": np.array(names)} | {name: values.numpy() for name, values in results.items()}
+    return {"feature_names": np.array(_component_names(sample.inputs.features))} | {
+        name: values.numpy() for name, values in results.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,9 +148,9 @@ class _Pairs:
         return torch.cat([receivers, receivers + self.displacements])
 
 
-def _probing_pairs(model: FieldModel) -> _Pairs:
+def _probing_pairs(model: Model) -> _Pairs:
     dim = model.config.dim
-    reach = max(model.config.network.relative_cutoff, model.kernel_at(1.0).support_radius)
+    reach = max(model.settings.relative_cutoff, model.kernel_at(1.0).support_radius)
     line = torch.linspace(-reach, reach, _POINTS_ON_LINE, dtype=torch.float64)
     on_axes = torch.cat([line[:, None] * axis for axis in torch.eye(dim, dtype=torch.float64)])
     radii = reach * (torch.arange(_RADII, dtype=torch.float64) + 0.5) / _RADII
@@ -176,45 +179,67 @@ def _directions(dim: int) -> Tensor:
     return torch.stack([width * angles.cos(), width * angles.sin(), height], dim=1)
 
 
-def _learned_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor:
+def _learned_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
     """Answers of the first convolution (P, F, C_out), by unit of each feature, without bias."""
-    twin = deepcopy(model).double()
-    network = model.config.network.model_copy(update={"normalize": False})
-    twin.config = model.config.model_copy(update={"network": network})
-    rest = sample.inputs.features.double().mean(dim=0).expand(2 * len(pairs.displacements), -1)
-    channels, units = model.config.boundary_channels, sample.inputs.units
-    geometry = twin.geometry(_isolated_inputs(pairs, rest, channels, units))
+    twin, given = deepcopy(model).double(), sample.inputs
+    twin.settings = model.settings.model_copy(update={"normalize": False})
+    rest = given.features.flat().double().mean(dim=0).expand(2 * len(pairs.displacements), -1)
+    isolated = _isolated_inputs(pairs, rest, given)
+    geometry = twin.geometry(isolated)
 
     def answer(features: Tensor) -> Tensor:
-        values = twin.network_inputs(_isolated_inputs(pairs, features, channels, units), geometry)[0]
+        values = twin.network_inputs(_isolated_inputs(pairs, features, given), geometry)[0]
         return twin.network.convs[0](values, geometry.fluid)[: len(pairs.displacements)]
 
     answers = [answer(raised) - answer(rest) for raised in _raised(rest)]
-    return torch.stack(answers, dim=1) / (_mean_window_sum(model, sample) if model.config.network.normalize else 1)
+    return torch.stack(answers, dim=1) / (_mean_window_sum(model, sample) if model.settings.normalize else 1)
 
 
-def _analytic_filters(model: FieldModel, sample: Sample, pairs: _Pairs) -> Tensor:
+def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
     """Answers of the analytic operator (P, F, C), by unit of each feature, for the frame's mass and mean density."""
     inputs, kernel = sample.inputs.double(), model.kernel_at(1.0)
-    densities = inputs.features[:, -1]
+    densities = _named(inputs.features, DENSITY)
     edges = radius_graph(inputs.positions, kernel.support_radius, inputs.box)
     mass = (densities / density(torch.ones_like(densities), edges, kernel)).mean()
-    rest = torch.zeros(2 * len(pairs.displacements), inputs.features.shape[1], dtype=torch.float64)
-    rest[:, -1] = densities.mean()
+    names = inputs.features.scalar_names
+    rest = torch.zeros(2 * len(pairs.displacements), inputs.features.flat().shape[1], dtype=torch.float64)
+    rest[:, names.index(DENSITY)] = densities.mean()
     edges = radius_graph(pairs.positions, kernel.support_radius)
 
-    def answer(features: Tensor) -> Tensor:
+    def answer(flat: Tensor) -> Tensor:
+        features = _unflattened(flat, inputs.features)
         state = FluidState(
             positions=pairs.positions,
-            velocities=features[:, 1:-1],
-            masses=mass.expand(len(features)),
-            densities=features[:, -1],
-            edges=edges,
+            velocities=_named(features, VELOCITY),
+            masses=mass.expand(len(flat)),
+            box=None,
+            kernel=kernel,
         )
-        field = TASKS[model.config.task](state, kernel)
-        return field[: len(pairs.displacements)]
+        answers = model.task.field(state.knowing(edges, _named(features, DENSITY)))
+        return answers[: len(pairs.displacements)]
 
     return torch.stack([answer(raised) for raised in _raised(rest)], dim=1)
+
+
+def _unflattened(flat: Tensor, like: Features) -> Features:
+    """Features of values (N, S + V · D), with the names of others."""
+    scalars, vectors = split_kinds(flat, like.kinds, like.vectors.shape[2])
+    return Features(scalars=scalars, vectors=vectors, scalar_names=like.scalar_names, vector_names=like.vector_names)
+
+
+def _named(features: Features, name: str) -> Tensor:
+    """A scalar (N,) or a vector (N, D) by its name."""
+    if name in features.scalar_names:
+        return features.scalars[:, features.scalar_names.index(name)]
+    return features.vectors[:, features.vector_names.index(name)]
+
+
+def _component_names(features: Features) -> list[str]:
+    """Symbols of the scalars and of the components of the vectors, as `Features.flat` orders them."""
+    symbols = {DENSITY: "ρ", VELOCITY: "v"}
+    axes = "xyz"[: features.vectors.shape[2]]
+    scalars = [symbols.get(name, "1") for name in features.scalar_names]
+    return scalars + [f"{symbols[name]}_{axis}" for name in features.vector_names for axis in axes]
 
 
 def _raised(rest: Tensor) -> list[Tensor]:
@@ -224,34 +249,38 @@ def _raised(rest: Tensor) -> list[Tensor]:
     return [rest + senders[:, None] * unit for unit in units]
 
 
-def _filter_units(sample: Sample, dim: int) -> Tensor:
-    """What filters of each feature [1, v, ρ] are multiples of, in the units of the data, (F, 1)."""
-    units = sample.inputs.units
-    return (sample.target_unit / torch.tensor([1.0, *[units.velocity] * dim, units.density]).double())[:, None]
+def _filter_units(sample: Sample) -> Tensor:
+    """What filters of each feature are multiples of, in the units of the data, (F, 1)."""
+    units, features = sample.inputs.units, sample.inputs.features
+    of_name = {DENSITY: units.density, VELOCITY: units.velocity}
+    scalars = [of_name.get(name, 1.0) for name in features.scalar_names]
+    vectors = [of_name[name] for name in features.vector_names for _ in range(features.vectors.shape[2])]
+    return (sample.target_unit / torch.tensor([*scalars, *vectors]).double())[:, None]
 
 
-def _isolated_inputs(pairs: _Pairs, features: Tensor, boundary_channels: int, units: Units) -> Inputs:
-    positions = pairs.positions
-    dim = positions.shape[1]
+def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
+    """The pairs as inputs with features (2P, F); where the frame has walls, no point of them is left."""
+    walls = like.wall_features
+    none = None if walls is None else replace(walls, scalars=walls.scalars[:0], vectors=walls.vectors[:0])
     return Inputs(
-        positions=positions,
-        features=features,
-        boundary_positions=positions.new_zeros(0, dim) if boundary_channels else None,
-        boundary_features=positions.new_zeros(0, boundary_channels) if boundary_channels else None,
-        box=Box([0.0] * dim, [1.0] * dim),
-        units=units,
+        positions=pairs.positions,
+        features=_unflattened(flat, like.features),
+        wall_positions=None if none is None else pairs.positions[:0],
+        wall_features=None if none is None else none.to(torch.float64),
+        box=Box([0.0] * like.dim, [1.0] * like.dim),
+        units=like.units,
     )
 
 
-def _mean_window_sum(model: FieldModel, sample: Sample) -> Tensor:
+def _mean_window_sum(model: Model, sample: Sample) -> Tensor:
     """Mean over particles of ψ, by which normalised filters are divided."""
-    cutoff = model.config.network.relative_cutoff
+    cutoff = model.settings.relative_cutoff
     edges = radius_graph(sample.inputs.positions.double(), cutoff, sample.inputs.box)
-    values = window_values((edges.distances / edges.cutoff) ** 2, model.config.network.window)
+    values = window_values((edges.distances / edges.cutoff) ** 2, model.settings.window)
     return values.sum() / edges.num_receivers
 
 
-def _combination(learned: Tensor, analytic: Tensor, volume: Tensor, model: FieldModel) -> Tensor:
+def _combination(learned: Tensor, analytic: Tensor, volume: Tensor, model: Model) -> Tensor:
     """Weights (C_out, C) of the layer's outputs: the target's units, or the nearest to the analytic filters."""
     if len(model.network.convs) == 1:
         return torch.diag(model.target_scale.double())
@@ -276,15 +305,19 @@ def _on_axes(filters: Tensor, pairs: _Pairs) -> Tensor:
     return filters[~pairs.ball].unflatten(0, (-1, len(pairs.line)))
 
 
-def _along_direction(filters: Tensor, pairs: _Pairs, task: str) -> Tensor:
-    """The part of filters (P, F, C) along d/r that turns velocities (D2) or the density (D3), by distance (K, M)."""
+def _along_direction(filters: Tensor, pairs: _Pairs, features: Features, reads_density: bool) -> Tensor:
+    """The part along d/r of filters (P, F, C) of the density, or else of the velocities, by distance (K, M)."""
     displacements = pairs.displacements[pairs.ball]
     directions = displacements / displacements.norm(dim=1, keepdim=True)
-    vectors = filters[pairs.ball, -1, :] if task in VECTOR_TASKS else filters[pairs.ball, 1:-1, 0]
+    answers = filters[pairs.ball]
+    if reads_density:
+        vectors = answers[:, features.scalar_names.index(DENSITY)]
+    else:
+        vectors = split_kinds(answers[:, :, 0], features.kinds, directions.shape[1])[1][:, 0]
     return (vectors * directions).sum(dim=1).unflatten(0, (len(pairs.radii), -1))
 
 
-def _relative_errors(model: FieldModel, sample: Sample) -> Tensor:
+def _relative_errors(model: Model, sample: Sample) -> Tensor:
     """Root mean square of each particle's error over the components, by the standard deviation of the target, (N,)."""
     prediction = model(sample.inputs, model.geometry(sample.inputs))
     return (prediction - model.standardize_target(sample.target)).double().square().mean(dim=1).sqrt()

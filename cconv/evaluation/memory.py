@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 
 from cconv.data.trajectory import Frame, Scene
-from cconv.models.model import FieldModel
+from cconv.models.model import Model
 
-Load = Callable[[Path], FieldModel]
+Load = Callable[[Path], Model]
 
 
 def peak_megabytes(

@@ -1,20 +1,21 @@
-"""Errors of a model on samples, and those of the trivial model that always predicts the mean."""
+"""Measures made of the errors of single frames: by other variances, by the thesis's measure, by blocks of time."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from cconv.data.features import standardize_vectors
-from cconv.data.targets import Sample
 from cconv.models.errors import FrameError, normalized_mse
+from cconv.models.model import Model
+from cconv.models.standardization import standardize_values
+from cconv.tasks.samples import Sample
 
 
-def own_variance(model, samples: Iterable[Sample]) -> float:
-    """Variance of the target over samples / that over the training split of a `FieldModel`.
+def own_variance(model: Model, samples: Iterable[Sample]) -> float:
+    """Variance of the target over samples / that over the training split of a model.
 
     An error divided by it is one by the variance of these samples: 1 is predicting their own mean.
     """
-    targets = standardize_vectors(model.standardize_target(sample.target) for sample in samples)
+    targets = standardize_values(model.standardize_target(sample.target) for sample in samples)
     return float(targets.scale[0] ** 2)
 
 

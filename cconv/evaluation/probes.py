@@ -7,14 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cconv.data.features import FluidState, fluid_state
 from cconv.data.splits import evenly_spaced
-from cconv.data.targets import TASKS, VECTOR_TASKS
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.errors import DataError
 from cconv.evaluation.stressed import State, still_states, stressed_states
 from cconv.neighbors import radius_graph
-from cconv.sph.kernels import AbstractKernel
+from cconv.tasks.features import FluidState
+from cconv.tasks.task import FieldTask
 
 REGIME_FRAMES = 20  # frames whose particles are sorted into regimes
 STRESSED_FRAMES = 3  # frames that are put into other states: the first, the middle one and the last
@@ -103,15 +102,14 @@ class Probes:
 
 
 def make_probes(
-    trajectories: Sequence[Trajectory], scene: Scene, task: str, kernel: AbstractKernel, reach: float | None = None
+    trajectories: Sequence[Trajectory], scene: Scene, task: FieldTask, reach: float | None = None
 ) -> Probes:
     """What models of a task are asked in a scene.
 
     Args:
         trajectories: Trajectories that no model was trained on.
         scene: Their scene.
-        task: "density_rate" or "density_gradient".
-        kernel: SPH kernel of the task.
+        task: What is asked.
         reach: Largest distance that a model searches; the kernel's support by default.
 
     Raises:
@@ -121,14 +119,15 @@ def make_probes(
     if not places:
         raise DataError("There is no validation frame to test stability on; give the split at least one.")
     chosen = [places[place] for place in evenly_spaced(len(places), REGIME_FRAMES)]
-    states = [fluid_state(trajectory[index], scene.box, kernel) for trajectory, index in chosen]
-    fields = torch.cat([TASKS[task](state, kernel) for state in states])
-    typical = max(float(fields.var(dim=0, correction=0).mean()), _rounding(states, task, kernel))
+    kernel = task.kernel_at(scene.particle_spacing, scene.dim)
+    states = [task.state(trajectory[index], scene) for trajectory, index in chosen]
+    fields = torch.cat([task.field(state) for state in states])
+    typical = max(float(fields.var(dim=0, correction=0).mean()), _rounding(states, task))
     reach = max(reach or 0.0, kernel.support_radius)
     fastest = max(float(state.velocities.norm(dim=1).max()) for state in states)
 
     def answered(state: State, origin: str) -> Probe:
-        return _answered(state, origin, task, kernel, typical)
+        return _answered(state, origin, task, typical)
 
     origins = {_origin(*place): place for place in chosen}
     plain = [
@@ -141,7 +140,7 @@ def make_probes(
         frame, origin = trajectory[index], _origin(trajectory, index)
         options = {"typical_rate": typical**0.5, "fastest": fastest, "reach": reach, "seed": seed}
         stressed += [answered(state, origin) for state in stressed_states(frame, scene, kernel, **options)]
-        if task not in VECTOR_TASKS:
+        if not task.output.vectors:
             still += [answered(state, origin) for state in still_states(frame, scene, fastest)]
     return Probes(
         typical=typical,
@@ -149,7 +148,7 @@ def make_probes(
         regimes=_regimes(plain, scene, typical),
         stressed=tuple(stressed),
         still=tuple(still),
-        rollout=None if task in VECTOR_TASKS else _rollout(trajectories[0], scene, task, kernel),
+        rollout=None if task.output.vectors else _rollout(trajectories[0], scene, task),
     )
 
 
@@ -157,15 +156,15 @@ def _origin(trajectory: Trajectory, index: int) -> str:
     return f"trajectory {trajectory.name}, frame {trajectory.first_frame + index}"
 
 
-def _rounding(states: Sequence[FluidState], task: str, kernel: AbstractKernel) -> float:
+def _rounding(states: Sequence[FluidState], task: FieldTask) -> float:
     """Square of a field so small that float32 cannot tell it from 0."""
     density = max(float(state.densities.max()) for state in states)
-    speed = 1.0 if task in VECTOR_TASKS else max(float(state.velocities.norm(dim=1).max()) for state in states)
-    return max((1e-4 * density * speed / kernel.smoothing_length) ** 2, torch.finfo(torch.float64).tiny)
+    speed = 1.0 if task.output.vectors else max(float(state.velocities.norm(dim=1).max()) for state in states)
+    return max((1e-4 * density * speed / states[0].kernel.smoothing_length) ** 2, torch.finfo(torch.float64).tiny)
 
 
-def _answered(state: State, origin: str, task: str, kernel: AbstractKernel, typical: float) -> Probe:
-    target = TASKS[task](fluid_state(state.frame, state.scene.box, kernel), kernel)
+def _answered(state: State, origin: str, task: FieldTask, typical: float) -> Probe:
+    target = task.field(task.state(state.frame, state.scene))
     affected = torch.ones(len(target), dtype=torch.bool) if state.affected is None else state.affected
     return Probe(
         name=state.name,
@@ -186,13 +185,13 @@ def _scale(targets: Tensor, typical: float) -> float:
     return max(float(targets.square().mean()) if len(targets) else 0.0, SMALLEST_SCALE * typical)
 
 
-def _rollout(trajectory: Trajectory, scene: Scene, task: str, kernel: AbstractKernel) -> Rollout:
+def _rollout(trajectory: Trajectory, scene: Scene, task: FieldTask) -> Rollout:
     frames = tuple(trajectory[index] for index in range(min(len(trajectory), ROLLOUT_FRAMES)))
-    states = [fluid_state(frame, scene.box, kernel) for frame in frames]
+    states = [task.state(frame, scene) for frame in frames]
     return Rollout(
         frames=frames,
         scene=scene,
-        targets=torch.stack([TASKS[task](state, kernel)[:, 0] for state in states]),
+        targets=torch.stack([task.field(state)[:, 0] for state in states]),
         densities=torch.stack([state.densities for state in states]),
     )
 

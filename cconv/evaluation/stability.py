@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
 from cconv.evaluation.probes import Probe, Probes, Rollout
-from cconv.models.model import FieldModel
+from cconv.models.model import Model
 
 NOT_FINITE = 1e9  # stands for an error that is infinite or no number, so that files can hold it
 PRECISE_STATES = ("as_it_is", "far_away")  # states in which float32 is compared with float64
@@ -41,11 +41,11 @@ class ModelPredictor:
         model: The model.
     """
 
-    def __init__(self, model: FieldModel):
+    def __init__(self, model: Model):
         self._model, self._exact = model, deepcopy(model).double()
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
-        """Field (N, C) in the units of the data, as `FieldModel.predict_frame`."""
+        """Field (N, C) in the units of the data, as `Model.predict_frame`."""
         return self._model.predict_frame(frame, scene)
 
     def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:

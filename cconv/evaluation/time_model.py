@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from scipy.stats import spearmanr
 
 from cconv.errors import ConfigError
-from cconv.evaluation.cost_model import Estimate
+from cconv.networks.counting import CountedCost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class TimeModel:
     us_per_byte: float
 
     @classmethod
-    def fit(cls, estimates: Sequence[Estimate], times: Sequence[float]) -> "TimeModel":
+    def fit(cls, estimates: Sequence[CountedCost], times: Sequence[float]) -> "TimeModel":
         """The coefficients, none negative, with the smallest squared relative errors.
 
         Args:
@@ -41,7 +41,7 @@ class TimeModel:
         constant, of_flops, of_bytes = (values / scales).tolist()
         return cls(us_per_particle=constant, us_per_flop=of_flops, us_per_byte=of_bytes)
 
-    def predict(self, estimate: Estimate) -> float:
+    def predict(self, estimate: CountedCost) -> float:
         """Time of one particle's prediction, µs."""
         return float(np.dot(_terms(estimate), (self.us_per_particle, self.us_per_flop, self.us_per_byte)))
 
@@ -67,7 +67,7 @@ class CostModelCheck:
     rank_correlation: float
 
 
-def check_cost_model(estimates: Mapping[str, Estimate], measured: Mapping[str, float]) -> CostModelCheck:
+def check_cost_model(estimates: Mapping[str, CountedCost], measured: Mapping[str, float]) -> CostModelCheck:
     """How well times follow from counted costs: each model is predicted from the others.
 
     Args:
@@ -99,5 +99,5 @@ def check_cost_model(estimates: Mapping[str, Estimate], measured: Mapping[str, f
     )
 
 
-def _terms(estimate: Estimate) -> tuple[float, float, float]:
+def _terms(estimate: CountedCost) -> tuple[float, float, float]:
     return 1.0, estimate.flops_per_particle, estimate.bytes_per_particle

@@ -11,15 +11,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from cconv.data.features import Standardization
-from cconv.data.targets import target_channels
 from cconv.errors import ConfigError, shown
 from cconv.files import read_json
-from cconv.models.model import FieldConfig, FieldModel, check_size
+from cconv.models.model import Model, ModelConfig, without_weights
+from cconv.models.standardization import unknown
 from cconv.validation import OpenModel, Real, Seed, validated
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
-FORMAT = 2  # of config.json; models of format 1 computed in the units of their training data
+FORMAT = 3  # of config.json; in format 1 models computed in the units of their data, in 2 features had no names
 LARGEST_HEADER = 2**20  # bytes of a weights file's list of contents
 
 
@@ -31,7 +30,7 @@ class _Card(OpenModel):
     valid_normalized_mse: Real | None = None
 
 
-def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
+def save_model(model: Model, folder: Path | str, card: dict) -> None:
     """Write a model: `model.safetensors`, `config.json`, `card.json`.
 
     The files are written to a temporary folder that then takes the place of `folder`, or that of its files one by one
@@ -59,7 +58,7 @@ def save_model(model: FieldModel, folder: Path | str, card: dict) -> None:
         shutil.rmtree(fresh, ignore_errors=True)
 
 
-def load_model(path: Path | str, task: str | None = None) -> FieldModel:
+def load_model(path: Path | str, task: str | None = None) -> Model:
     """Model from a folder that `save_model` wrote.
 
     Args:
@@ -81,27 +80,24 @@ def load_model(path: Path | str, task: str | None = None) -> FieldModel:
             f"{folder}: the model is for task {config.task!r}, not {shown(task)}; give a checkpoint of that task."
         )
     tensors = _read_weights(folder, config)
-    features, targets = (
-        Standardization(tensors[f"{name}_mean"], tensors[f"{name}_scale"]) for name in ("feature", "target")
-    )
-    model = FieldModel(config, features, targets)
+    model = Model(config, unknown(config.inputs, config.dim), unknown(config.output, config.dim))
     model.load_state_dict(tensors)
     return model.eval()
 
 
-def _read_config(path: Path) -> FieldConfig:
+def _read_config(path: Path) -> ModelConfig:
     stored = read_json(path, error=ConfigError)
     if isinstance(stored, dict):
         version = stored.pop("format", 1)
         if version != FORMAT:
             raise ConfigError(
-                f"{path}: `format` is {shown(version)}, and this version reads {FORMAT}, whose models know no units of "
-                "the data; train or fit the model again (`cconv train`, `cconv fit`)."
+                f"{path}: `format` is {shown(version)}, and this version reads {FORMAT}; train or fit the model again "
+                "(`cconv train`, `cconv fit`)."
             )
-    return validated(FieldConfig, stored, path)
+    return validated(ModelConfig, stored, path)
 
 
-def _read_weights(folder: Path, config: FieldConfig) -> dict[str, Tensor]:
+def _read_weights(folder: Path, config: ModelConfig) -> dict[str, Tensor]:
     """The weights of a model, whose names and shapes are compared before any of them is read."""
     path = folder / WEIGHTS
     wanted = _shapes(config)
@@ -126,12 +122,9 @@ def _read_weights(folder: Path, config: FieldConfig) -> dict[str, Tensor]:
     return tensors
 
 
-def _shapes(config: FieldConfig) -> dict[str, tuple]:
+def _shapes(config: ModelConfig) -> dict[str, tuple]:
     """Shape and type of every tensor of a model's weights."""
-    channels = (config.feature_channels, target_channels(config.task, config.dim))
-    features, targets = (Standardization(torch.empty(count), torch.empty(count)) for count in channels)
-    hollow = check_size(config, features, targets)
-    return {name: (tuple(tensor.shape), "F32") for name, tensor in hollow.state_dict().items()}
+    return {name: (tuple(tensor.shape), "F32") for name, tensor in without_weights(config).state_dict().items()}
 
 
 def _check_numbers(path: Path, tensors: Mapping[str, Tensor]) -> None:

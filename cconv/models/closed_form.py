@@ -1,25 +1,64 @@
-"""The closed form: models of a single layer, fitted by least squares in seconds."""
+"""The closed form: models of a single layer are linear in their coefficients, which least squares finds in seconds."""
 
 from collections.abc import Callable, Iterable, Sequence
 
+import torch
+from torch import Tensor
+
 from cconv.data.dataset import Dataset
-from cconv.data.targets import Sample, iterate_samples
 from cconv.errors import ConfigError
-from cconv.models.model import FieldModel, NetworkConfig, build_field_model
-from cconv.networks.linear_terms import NormalEquations, linear_layer
-from cconv.sph.kernels import kernel_named
+from cconv.models.model import Model, build_model
+from cconv.networks import RadialNetSettings
+from cconv.networks.network import NetworkSettings
+from cconv.tasks import task_named
+from cconv.tasks.samples import Sample, iterate_samples
+
+
+class NormalEquations:
+    """Least squares of ``terms @ coefficients ≈ targets``, row by row, in float64.
+
+    Args:
+        num_terms: Number of coefficients P of each output.
+        num_outputs: Number of outputs C.
+    """
+
+    def __init__(self, num_terms: int, num_outputs: int):
+        self._products = torch.zeros(num_terms, num_terms, dtype=torch.float64)
+        self._projections = torch.zeros(num_terms, num_outputs, dtype=torch.float64)
+
+    def add(self, terms: Tensor, targets: Tensor) -> None:
+        """Take in terms (R, P) and targets (R, C)."""
+        self._products.addmm_(terms.T, terms)
+        self._projections.addmm_(terms.T, targets)
+
+    def solve(self, ridge: float) -> Tensor:
+        """Coefficients (P, C) that minimise the mean squared error + ``ridge`` · mean square of a term · |c|².
+
+        Raises:
+            ConfigError: If the equations cannot be solved, e.g. for dependent terms without ridge.
+        """
+        size = len(self._products)
+        shift = ridge * self._products.diagonal().mean() * torch.eye(size, dtype=torch.float64)
+        factor, failed = torch.linalg.cholesky_ex(self._products + shift)
+        if failed:
+            raise ConfigError(
+                f"`ridge` must be larger, got {ridge:g}: the {size} terms depend on each other to rounding; "
+                f"take {max(100 * ridge, 1e-10):g} or more."
+            )
+        return torch.cholesky_solve(self._projections, factor)
 
 
 def fit_closed_form(
     dataset: Dataset,
     task: str = "density_rate",
     *,
-    network: NetworkConfig | None = None,
+    network: NetworkSettings | None = None,
+    features: Sequence[str] | None = None,
     kernel: str = "cubic_spline",
     smoothing_length: float | None = None,
     ridge: float = 1e-10,
     progress: Callable[[Iterable], Iterable] = iter,
-) -> FieldModel:
+) -> Model:
     """Fit a model of a single layer to the training split of a data set.
 
     Least squares over all particles of all frames, accumulated frame by frame in float64 normal equations. The model
@@ -28,8 +67,9 @@ def fit_closed_form(
     Args:
         dataset: Data set.
         task: "density_rate" or "density_gradient".
-        network: Basis, message, cutoff, window, mapping ... of the layer; by default 16 radial terms on differences to
-            the neighbours within the support of the kernel.
+        network: Settings of the layer: message, cutoff, window, mapping ...; by default 16 radial terms on differences
+            to the neighbours within the support of the kernel.
+        features: Features of the task that the layer takes; None for all.
         kernel: SPH kernel of the target.
         smoothing_length: Its h, length; None for the particle spacing.
         ridge: Weight of the squared coefficients, in mean squares of a term.
@@ -39,23 +79,18 @@ def fit_closed_form(
         ConfigError: If the network has several layers, or the terms depend on each other and `ridge` is too small.
     """
     spacing = dataset.scene.particle_spacing
-    smoothing_length = smoothing_length or spacing
-    field = kernel_named(kernel)(smoothing_length, dataset.scene.dim)
+    asked = task_named(task, kernel, 1.0 if smoothing_length is None else smoothing_length / spacing)
     if network is None:
-        network = NetworkConfig(
-            layers=1,
-            basis="radial",
-            message="difference",
-            relative_cutoff=field.support_radius / spacing,
-        )
-    samples = list(iterate_samples(dataset, "train", task, field))
-    model = build_field_model(network, dataset.scene, task, kernel, smoothing_length, samples)
+        reach = asked.kernel_at(1.0, dataset.scene.dim).support_radius
+        network = RadialNetSettings(layers=1, message="difference", relative_cutoff=reach)
+    samples = list(iterate_samples(dataset, "train", asked))
+    model = build_model(network, asked, features or asked.features, dataset.scene, samples)
     solve_closed_form(model, samples, ridge, progress)
     return model.eval()
 
 
 def solve_closed_form(
-    model: FieldModel, samples: Sequence[Sample], ridge: float = 1e-10, progress: Callable[[Iterable], Iterable] = iter
+    model: Model, samples: Sequence[Sample], ridge: float = 1e-10, progress: Callable[[Iterable], Iterable] = iter
 ) -> None:
     """Set the coefficients of a model of a single layer to the least-squares solution on `samples`, in place.
 
@@ -65,7 +100,7 @@ def solve_closed_form(
     """
     if not ridge >= 0:
         raise ConfigError(f"`ridge` must be at least 0, got {ridge}.")
-    layer = linear_layer(model.network)
+    layer = model.network.linear_terms()
     equations: list[NormalEquations] = []
     for sample in progress(samples):
         inputs = sample.inputs.double()

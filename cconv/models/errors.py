@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cconv.data.features import standardize_vectors
-from cconv.data.targets import Sample
+from cconv.models.model import Model
+from cconv.models.standardization import standardize_values
+from cconv.tasks.samples import Sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +33,11 @@ class FrameError:
 
 
 @torch.no_grad()
-def frame_errors(model, samples: Iterable[Sample], geometry: Callable | None = None) -> list[FrameError]:
+def frame_errors(model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> list[FrameError]:
     """Errors of a model on each frame.
 
     Args:
-        model: A `FieldModel`.
+        model: The model.
         samples: Frames with targets.
         geometry: Sample to geometry, e.g. a cache; by default computed afresh.
     """
@@ -58,7 +59,7 @@ def mean_predictor_error(samples: Iterable[Sample], train_samples: Iterable[Samp
         samples: Frames of a split.
         train_samples: Frames of the training split.
     """
-    training = standardize_vectors(sample.target for sample in train_samples)
+    training = standardize_values(sample.target for sample in train_samples)
     errors = []
     for sample in samples:
         target = (sample.target.double() - training.mean) / training.scale

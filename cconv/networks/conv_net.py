@@ -3,20 +3,49 @@
 Source: Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020), section 4.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor, nn
 
-from cconv.errors import ConfigError, ShapeError, check_choice
-from cconv.nn.continuous_conv import ContinuousConv, ConvGeometry
+from cconv.errors import ConfigError, check_choice
+from cconv.neighbors import Edges
+from cconv.networks.counting import (
+    FLOAT,
+    INDEX,
+    CountedConv,
+    CountedCost,
+    NeighborDensity,
+    Pairs,
+    count_arrays,
+    count_filters,
+    count_linear,
+    count_search,
+    total,
+    window_arrays,
+)
+from cconv.networks.network import (
+    ConvolutionSettings,
+    LinearTerms,
+    Network,
+    assign_rows,
+    check_single_layer,
+    check_walls,
+)
+from cconv.nn.continuous_conv import MESSAGES, ContinuousConv, ConvGeometry
+from cconv.nn.kinds import Kinds, split_kinds
+from cconv.ops.convolution import columns
+from cconv.validation import Flag, Whole
 
 ACTIVATIONS = {"relu": F.relu, "gelu": F.gelu, "tanh": torch.tanh, "leaky_relu": F.leaky_relu}
 SKIPS = ("before_activation", "after_activation", "none")
 
 
-class ConvNet(nn.Module):
+class ConvNet(Network):
     """Particle network of the thesis, figure 3.1.
 
     Layer 0 concatenates boundary convolution, fluid convolution and fully connected layer, each of `layer_channels[0]`
@@ -108,33 +137,16 @@ class ConvNet(nn.Module):
         self,
         features: Tensor,
         geometry: ConvGeometry,
-        boundary_features: Tensor | None = None,
-        boundary_geometry: ConvGeometry | None = None,
+        wall_features: Tensor | None = None,
+        wall_geometry: ConvGeometry | None = None,
     ) -> Tensor:
-        """Network output at the fluid particles.
-
-        Args:
-            features: Fluid features (N, C_in).
-            geometry: Fluid particles seen from fluid particles.
-            boundary_features: (B, C_boundary), only with a boundary branch.
-            boundary_geometry: Boundary points seen from fluid particles, only with a boundary branch.
-
-        Returns:
-            (N, C_out).
-
-        Raises:
-            ShapeError: If boundary inputs are missing, or come without a boundary branch.
-        """
+        """Outputs (N, C_out) at the fluid particles, of features (N, C_in) and (B, C_boundary); see `Network`."""
+        check_walls(self.boundary_conv is not None, wall_features, wall_geometry)
         branches = [self.convs[0](features, geometry)]
         if self.own_dense is not None:
             branches.append(self.own_dense(self.own(features)))
-        if (self.boundary_conv is None) != (boundary_features is None or boundary_geometry is None):
-            raise ShapeError(
-                "`boundary_features` and `boundary_geometry` must be given exactly when the network has a boundary "
-                f"branch; it has {'none' if self.boundary_conv is None else 'one'}."
-            )
         if self.boundary_conv is not None:
-            branches.insert(0, self.boundary_conv(boundary_features, boundary_geometry))
+            branches.insert(0, self.boundary_conv(wall_features, wall_geometry))
         output = torch.cat(branches, dim=1) if len(self.convs) > 1 else sum(branches)
         for conv, dense in zip(self.convs[1:], self.dense[bool(self.own_channels) :], strict=True):
             output = self._layer(output, conv, dense, geometry)
@@ -146,6 +158,11 @@ class ConvNet(nn.Module):
         if self.skip == "none" or output.shape != previous.shape:
             return output
         return output + (previous if self.skip == "before_activation" else activated)
+
+    def linear_terms(self) -> "GridTerms":
+        """The network of a single layer as a linear map of its coefficients."""
+        check_single_layer(len(self.convs))
+        return GridTerms(self)
 
 
 def _linear(
@@ -159,3 +176,150 @@ def _linear(
     else:
         nn.init.xavier_uniform_(layer.weight, generator=generator)
     return layer
+
+
+class GridTerms(LinearTerms):
+    """The single layer of a `ConvNet` as a linear map of its coefficients."""
+
+    def __init__(self, network: ConvNet):
+        self.network = network
+
+    def terms(
+        self,
+        features: Tensor,
+        geometry: ConvGeometry,
+        wall_features: Tensor | None = None,
+        wall_geometry: ConvGeometry | None = None,
+    ) -> list[Tensor]:
+        """Terms (N, P): columns of the boundary and the fluid, a particle's own features, one; those that there are."""
+        own = MESSAGES[self.network.convs[0].message]
+        parts = [columns(features, geometry.reads, own), self.network.own(features)]
+        if self._bias is not None:
+            parts.append(torch.ones_like(features[:, :1]))
+        if wall_features is not None:
+            parts.insert(0, columns(wall_features, wall_geometry.reads))
+        return [torch.cat(parts, dim=1)]
+
+    def targets(self, target: Tensor) -> list[Tensor]:
+        """Targets (N, C) of each set of terms."""
+        return [target]
+
+    @torch.no_grad()
+    def assign(self, coefficients: Sequence[Tensor]) -> None:
+        """Make coefficients (P, C) those of the network."""
+        (values,) = coefficients
+        convs = [conv for conv in (self.network.boundary_conv, self.network.convs[0]) if conv is not None]
+        weights = [conv.filters for conv in convs]
+        if self.network.own_dense is not None:
+            weights.append(self.network.own_dense.weight.T)
+        for bias in (conv.bias for conv in convs if conv.bias is not None):
+            bias.zero_()
+        assign_rows([*weights, *([] if self._bias is None else [self._bias[None]])], values)
+
+    @property
+    def _bias(self) -> Tensor | None:
+        """The bias that is fitted; convolutions with another of their own keep 0."""
+        dense = self.network.own_dense
+        return None if dense is None else dense.bias
+
+
+class ConvNetSettings(ConvolutionSettings):
+    """Hyperparameters of a `ConvNet`.
+
+    The defaults have the published layer sizes and filters: 692,902 parameters for 4 inputs and 3 outputs in a scene
+    with normals. `relative_cutoff` is the filter radius R (published: diameter 0.225 = 1.5·6·0.025 at spacing 0.05, so
+    R = 2.25 spacings). Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
+    """
+
+    architecture: Literal["conv_net"] = "conv_net"
+    kernel_size: Whole = Field(4, ge=1, le=32)
+    mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (
+        "ball_to_cube_volume_preserving"
+    )
+    interpolation: Literal["linear", "nearest_neighbor", "linear_border"] = "linear"
+    align_corners: Flag = True
+    skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
+    initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
+
+    def build(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
+    ) -> ConvNet:
+        """The network with fresh weights; arguments as of `NetworkSettings.build`."""
+        return ConvNet(
+            self.sent(inputs).num_values(dim),
+            (*self.hidden_widths, outputs.num_values(dim)),
+            self.kernel_size,
+            dim,
+            boundary_channels=0 if walls is None else walls.num_values(dim),
+            activation=self.activation,
+            message=self.message,
+            skip=self.skip,
+            initialization=self.initialization,
+            own_channels=self.own(inputs, outputs).num_values(dim) if self.takes_differences else None,
+            bias=self.has_intercept(outputs),
+            generator=generator,
+        )
+
+    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+        """Features in the published order: the constant, unless differences are taken, vectors, further scalars."""
+        scalars, vectors = split_kinds(features, kinds, dim)
+        constant = [] if self.takes_differences else [scalars[:, :1]]
+        return torch.cat([*constant, vectors.flatten(1), scalars[:, 1:]], dim=1)
+
+    def geometry(self, edges: Edges) -> ConvGeometry:
+        """Cells and weights of the filters that each pair reads."""
+        return ConvGeometry(
+            edges,
+            self.kernel_size,
+            mapping=self.mapping,
+            window=self.window,
+            interpolation=self.interpolation,
+            align_corners=self.align_corners,
+            normalize=self.normalize,
+        )
+
+    def count(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
+    ) -> CountedCost:
+        """Cost of one particle's prediction; arguments as of `NetworkSettings.count`."""
+        fluid, boundary = around.pairs(self.relative_cutoff, dim)
+        searched = [fluid] if walls is None else [fluid, boundary]
+        convs, dense = self._parts(inputs, walls, outputs, dim, fluid, boundary)
+        return total(
+            [
+                *(self._count_conv(conv, dim) for conv in convs),
+                *(count_arrays(self._arrays(dim), pairs) for pairs in searched),
+                *(count_search(pairs, dim) for pairs in searched),
+                *(count_linear(before, after, dim) for before, after in dense),
+            ]
+        )
+
+    def _parts(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, fluid: Pairs, boundary: Pairs
+    ) -> tuple[list[CountedConv], list[tuple[Kinds, Kinds]]]:
+        """Convolutions and fully connected layers; a grid knows scalars alone."""
+        first, *rest = [*self.hidden_widths, outputs.num_values(dim)]
+        features = self.sent(inputs).num_values(dim)
+        own = self.own(inputs, outputs).num_values(dim) if self.takes_differences else features
+        widths = [(1 + (walls is not None) + bool(own)) * first, *rest]
+        hidden = [(Kinds(before, 0), Kinds(after, 0)) for before, after in pairwise(widths)]
+        dense = [*([(Kinds(own, 0), Kinds(first, 0))] if own else []), *hidden]
+        convs = [CountedConv(*kinds, fluid) for kinds in [(Kinds(features, 0), Kinds(first, 0)), *hidden]]
+        if walls is not None:
+            convs.append(CountedConv(Kinds(walls.num_values(dim), 0), Kinds(first, 0), boundary))
+        return convs, dense
+
+    def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
+        corners = 1 if self.interpolation == "nearest_neighbor" else 2**dim
+        pair = INDEX + (dim + 2) * FLOAT
+        sizes = conv.inputs.scalars, conv.outputs.scalars, self.kernel_size**dim, corners
+        return count_filters(*sizes, conv.pairs.senders, conv.pairs.neighbors, pair)
+
+    def _arrays(self, dim: int) -> int:
+        """Arrays of all pairs from displacements to cells, fractions and weights, as `nn.filters` makes them."""
+        mapped = {
+            "identity": 0,
+            "ball_to_cube_radial": 4 * dim + 4,
+            "ball_to_cube_volume_preserving": (0, 0, 20, 53)[dim],
+        }[self.mapping]
+        return 12 * dim + mapped + window_arrays(self.window, self.normalize)

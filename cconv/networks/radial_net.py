@@ -1,11 +1,45 @@
 """RadialNet: radial convolutions and linear maps in parallel, equivariant to rotations and reflections as a whole."""
 
+from collections.abc import Sequence
+from typing import Literal
+
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from cconv.errors import ConfigError, ShapeError, check_choice
+from cconv.errors import ConfigError, check_choice
+from cconv.neighbors import Edges
 from cconv.networks.conv_net import ACTIVATIONS
-from cconv.nn.radial_conv import Channels, RadialConv, RadialGeometry, join_kinds, split_kinds
+from cconv.networks.counting import (
+    ARRAY,
+    FLOAT,
+    INDEX,
+    CountedConv,
+    CountedCost,
+    NeighborDensity,
+    Pairs,
+    count_arrays,
+    count_filters,
+    count_linear,
+    count_search,
+    total,
+    window_arrays,
+)
+from cconv.networks.network import (
+    ConvolutionSettings,
+    LinearTerms,
+    Network,
+    assign_rows,
+    check_single_layer,
+    check_walls,
+)
+from cconv.nn.kinds import Kinds, join_kinds, split_kinds
+from cconv.nn.radial_conv import RadialConv, RadialGeometry
+from cconv.ops.convolution import columns
+from cconv.ops.radial import MOST_OUTPUTS
+from cconv.validation import Whole
+
+NO_VALUES = Kinds(0, 0)
 
 
 class VectorLinear(nn.Module):
@@ -21,8 +55,8 @@ class VectorLinear(nn.Module):
 
     def __init__(
         self,
-        in_channels: Channels,
-        out_channels: Channels,
+        in_channels: Kinds,
+        out_channels: Kinds,
         dim: int,
         bias: bool = True,
         generator: torch.Generator | None = None,
@@ -44,7 +78,7 @@ class VectorLinear(nn.Module):
         return join_kinds(linear if self.bias is None else linear + self.bias, mapped)
 
 
-class RadialNet(nn.Module):
+class RadialNet(Network):
     """Network of scalars and vectors.
 
     Every layer adds a radial convolution and a linear map of its input, the first one a convolution of the boundary
@@ -71,16 +105,16 @@ class RadialNet(nn.Module):
 
     def __init__(
         self,
-        in_channels: Channels,
-        layer_channels: tuple[Channels, ...],
+        in_channels: Kinds,
+        layer_channels: tuple[Kinds, ...],
         num_terms: int,
         dim: int,
         *,
-        boundary_channels: Channels = (0, 0),
+        boundary_channels: Kinds = NO_VALUES,
         activation: str = "relu",
         message: str = "absolute",
         residual: bool = True,
-        own_channels: Channels | None = None,
+        own_channels: Kinds | None = None,
         bias: bool = True,
         generator: torch.Generator | None = None,
     ):
@@ -122,33 +156,16 @@ class RadialNet(nn.Module):
         self,
         features: Tensor,
         geometry: RadialGeometry,
-        boundary_features: Tensor | None = None,
-        boundary_geometry: RadialGeometry | None = None,
+        wall_features: Tensor | None = None,
+        wall_geometry: RadialGeometry | None = None,
     ) -> Tensor:
-        """Network output at the fluid particles.
-
-        Args:
-            features: Values of fluid particles (N, S + V · D).
-            geometry: Fluid particles seen from fluid particles.
-            boundary_features: Values of boundary points, only with a boundary branch.
-            boundary_geometry: Boundary points seen from fluid particles, only with a boundary branch.
-
-        Returns:
-            Scalars and vectors of the last layer, (N, S + V · D).
-
-        Raises:
-            ShapeError: If boundary inputs are missing, or come without a boundary branch.
-        """
-        if (self.boundary_conv is None) != (boundary_features is None or boundary_geometry is None):
-            raise ShapeError(
-                "`boundary_features` and `boundary_geometry` must be given exactly when the network has a boundary "
-                f"branch; it has {'none' if self.boundary_conv is None else 'one'}."
-            )
+        """Scalars and vectors of the last layer, (N, S + V · D), of such values of its inputs; see `Network`."""
+        check_walls(self.boundary_conv is not None, wall_features, wall_geometry)
         output = self.convs[0](features, geometry)
         if self.own_dense is not None:
             output = output + self.own_dense(self.own(features))
         if self.boundary_conv is not None:
-            output = output + self.boundary_conv(boundary_features, boundary_geometry)
+            output = output + self.boundary_conv(wall_features, wall_geometry)
         following_dense = self.dense[any(self.own_channels) :]
         for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
@@ -156,7 +173,157 @@ class RadialNet(nn.Module):
             output = following + output if self.residual and following.shape == output.shape else following
         return output
 
-    def _activate(self, values: Tensor, channels: Channels) -> Tensor:
+    def _activate(self, values: Tensor, channels: Kinds) -> Tensor:
         scalars, vectors = split_kinds(values, (sum(channels), channels[1]), self.dim)
         passed, gates = scalars.split(channels, dim=1)
         return join_kinds(ACTIVATIONS[self.activation](passed), torch.sigmoid(gates)[:, :, None] * vectors)
+
+    def linear_terms(self) -> "RadialTerms":
+        """The network of a single layer as a linear map of its coefficients."""
+        check_single_layer(len(self.convs))
+        return RadialTerms(self)
+
+
+class RadialTerms(LinearTerms):
+    """The single layer of a `RadialNet` as a linear map of its coefficients: scalars apart from vectors."""
+
+    def __init__(self, network: RadialNet):
+        self.network = network
+
+    def terms(
+        self,
+        features: Tensor,
+        geometry: RadialGeometry,
+        wall_features: Tensor | None = None,
+        wall_geometry: RadialGeometry | None = None,
+    ) -> list[Tensor]:
+        """Terms of the scalars (N, P) and of the components of the vectors (N · D, P'), where there are any."""
+        convolved = [(self.network.convs[0], features, geometry)]
+        if wall_features is not None:
+            convolved.insert(0, (self.network.boundary_conv, wall_features, wall_geometry))
+        gathered = [_radial_columns(*inputs) for inputs in convolved]
+        scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
+        of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
+        if self.network.own_dense is not None and self.network.own_dense.bias is not None:
+            of_scalars.append(torch.ones_like(features[:, :1]))
+        of_vectors = [*(to_vectors for _, to_vectors in gathered), vectors.transpose(1, 2).flatten(0, 1)]
+        terms = [torch.cat(of_scalars, dim=1), torch.cat(of_vectors, dim=1)]
+        return [values for values, count in zip(terms, self._out_channels, strict=True) if count]
+
+    def targets(self, target: Tensor) -> list[Tensor]:
+        """Targets (N, S) and (N · D, V) of each set of terms."""
+        scalars, vectors = split_kinds(target, self._out_channels, self.network.dim)
+        targets = [scalars, vectors.transpose(1, 2).flatten(0, 1)]
+        return [values for values, count in zip(targets, self._out_channels, strict=True) if count]
+
+    @torch.no_grad()
+    def assign(self, coefficients: Sequence[Tensor]) -> None:
+        """Make coefficients (P, S) and (P', V) those of the network."""
+        network, dense = self.network, self.network.own_dense
+        convs = [conv for conv in (network.boundary_conv, network.convs[0]) if conv is not None]
+        weights = [[conv.scalar_filters for conv in convs], [conv.vector_filters for conv in convs]]
+        if dense is not None:
+            weights[0] += [dense.scalar_weights, *([] if dense.bias is None else [dense.bias[None]])]
+            weights[1] += [dense.vector_weights]
+        present = [kind for kind, count in zip(weights, self._out_channels, strict=True) if count]
+        for tensors, values in zip(present, coefficients, strict=True):
+            assign_rows(tensors, values)
+
+    @property
+    def _out_channels(self) -> tuple[int, int]:
+        return self.network.convs[0].out_channels
+
+
+def _radial_columns(conv: RadialConv, features: Tensor, geometry: RadialGeometry) -> tuple[Tensor, Tensor]:
+    to_scalars, to_vectors = geometry.messages(features, conv.in_channels, conv.message)
+    components = [columns(component, geometry.reads) for component in to_vectors]
+    return columns(to_scalars, geometry.reads), torch.stack(components, dim=1).flatten(0, 1)
+
+
+class RadialNetSettings(ConvolutionSettings):
+    """Hyperparameters of a `RadialNet`, each of whose hidden layers has so many scalars and as many vectors."""
+
+    is_equivariant = True
+
+    architecture: Literal["radial_net"] = "radial_net"
+    radial_terms: Whole = Field(16, ge=1, le=512)
+    skip: Literal["before_activation", "none"] = "before_activation"
+
+    def build(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
+    ) -> RadialNet:
+        """The network with fresh weights; arguments as of `NetworkSettings.build`."""
+        return RadialNet(
+            self.sent(inputs),
+            (*(Kinds(width, width) for width in self.hidden_widths), outputs),
+            self.radial_terms,
+            dim,
+            boundary_channels=walls or NO_VALUES,
+            activation=self.activation,
+            message=self.message,
+            residual=self.skip == "before_activation",
+            own_channels=self.own(inputs, outputs),
+            bias=self.has_intercept(outputs),
+            generator=generator,
+        )
+
+    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+        """Scalars, without the constant where differences are taken, then vectors."""
+        return features[:, 1:] if self.takes_differences else features
+
+    def geometry(self, edges: Edges) -> RadialGeometry:
+        """Radial terms and direction of each pair."""
+        return RadialGeometry(edges, self.radial_terms, window=self.window, normalize=self.normalize)
+
+    def count(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
+    ) -> CountedCost:
+        """Cost of one particle's prediction; arguments as of `NetworkSettings.count`."""
+        fluid, boundary = around.pairs(self.relative_cutoff, dim)
+        searched = [fluid] if walls is None else [fluid, boundary]
+        convs, dense = self._parts(inputs, walls, outputs, fluid, boundary)
+        return total(
+            [
+                *(self._count_conv(conv, dim) for conv in convs),
+                *(count_arrays(self._arrays(dim, pairs, convs), pairs) for pairs in searched),
+                *(count_search(pairs, dim) for pairs in searched),
+                *(count_linear(before, after, dim) for before, after in dense),
+            ]
+        )
+
+    def _parts(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, fluid: Pairs, boundary: Pairs
+    ) -> tuple[list[CountedConv], list[tuple[Kinds, Kinds]]]:
+        """Convolutions and linear maps; each vector of a hidden layer has a scalar for its gate."""
+        hidden = [Kinds(width, width) for width in self.hidden_widths]
+        before = [self.sent(inputs), *hidden]
+        after = [*(Kinds(scalars + vectors, vectors) for scalars, vectors in hidden), outputs]
+        mapped = zip([self.own(inputs, outputs), *hidden], after, strict=True)
+        convs = [CountedConv(*kinds, fluid) for kinds in zip(before, after, strict=True)]
+        if walls is not None:
+            convs.append(CountedConv(walls, after[0], boundary))
+        return convs, [kinds for kinds in mapped if any(kinds[0])]
+
+    def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
+        """Pairs read the filters of all outputs themselves where these are few; else messages are written down."""
+        (scalars, vectors), (to_scalars, to_vectors), neighbors = conv.inputs, conv.outputs, conv.pairs.neighbors
+        of_scalars, of_vectors, components = scalars + vectors, scalars + 2 * vectors, scalars + dim * vectors
+        if max(conv.outputs) <= MOST_OUTPUTS:
+            reads = of_scalars * to_scalars + (of_scalars + dim * vectors) * to_vectors
+            # Two values and a message of each read; projections, directions.
+            flops = 2.0 * (3 * reads + dim * vectors + dim * to_vectors)
+            moved = 2 * INDEX + (dim + 1 + components + reads) * FLOAT
+            added = (to_scalars + dim * to_vectors) * ARRAY
+            return CountedCost(flops_per_particle=neighbors * flops, bytes_per_particle=neighbors * moved + added)
+        messages = neighbors * ARRAY * (4 * components + 2 * of_scalars + 4 * dim * of_vectors)
+        shape = self.radial_terms, min(2, self.radial_terms), neighbors, neighbors, INDEX + 3 * FLOAT
+        of_each_axis = [count_filters(of_vectors, to_vectors, *shape)] * (dim if to_vectors else 0)
+        written = CountedCost(bytes_per_particle=messages)
+        return total([written, count_filters(of_scalars, to_scalars, *shape), *of_each_axis])
+
+    def _arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
+        """Arrays of all pairs: the window, and terms and directions where a convolution takes messages of each."""
+        weighted = self.window != "none" or self.normalize
+        arrays = window_arrays(self.window, self.normalize) if weighted else 0
+        written = any(max(conv.outputs) > MOST_OUTPUTS for conv in convs if conv.pairs is pairs)
+        return arrays + (3 * dim + 12 if written else 0)

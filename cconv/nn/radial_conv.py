@@ -31,27 +31,10 @@ from cconv.nn.continuous_conv import (
     uniform_filters,
 )
 from cconv.nn.filters import WINDOWS, interpolate
+from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.ops import radial
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
-
-Channels = tuple[int, int]  # scalars, vectors
-
-
-def num_values(channels: Channels, dim: int) -> int:
-    """Numbers that hold so many scalars and vectors: scalars first, then the D components of each vector."""
-    return channels[0] + channels[1] * dim
-
-
-def split_kinds(values: Tensor, channels: Channels, dim: int) -> tuple[Tensor, Tensor]:
-    """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
-    scalars, vectors = values.split([channels[0], channels[1] * dim], dim=1)
-    return scalars, vectors.reshape(len(values), channels[1], dim)
-
-
-def join_kinds(scalars: Tensor, vectors: Tensor) -> Tensor:
-    """Values (N, S + V · D) of scalars (N, S) and vectors (N, V, D)."""
-    return torch.cat([scalars, vectors.flatten(1)], dim=1)
 
 
 class RadialGeometry:
@@ -151,7 +134,7 @@ class RadialGeometry:
         with torch.inference_mode(False), torch.set_grad_enabled(self._differentiates):
             yield
 
-    def messages(self, features: Tensor, channels: Channels, message: str) -> tuple[Tensor, Tensor]:
+    def messages(self, features: Tensor, channels: Kinds, message: str) -> tuple[Tensor, Tensor]:
         """What each edge contributes before the radial terms.
 
         Returns:
@@ -186,8 +169,8 @@ class RadialConv(nn.Module):
 
     def __init__(
         self,
-        in_channels: Channels,
-        out_channels: Channels,
+        in_channels: Kinds,
+        out_channels: Kinds,
         num_terms: int,
         dim: int,
         *,
@@ -197,7 +180,8 @@ class RadialConv(nn.Module):
     ):
         super().__init__()
         check_choice("message", message, MESSAGES)
-        self.in_channels, self.out_channels, self.dim, self.message = in_channels, out_channels, dim, message
+        self.in_channels, self.out_channels = Kinds(*in_channels), Kinds(*out_channels)
+        self.dim, self.message = dim, message
         scalars, vectors = in_channels
         self.scalar_filters = uniform_filters((num_terms,), scalars + vectors, out_channels[0], generator)
         self.vector_filters = uniform_filters((num_terms,), scalars + 2 * vectors, out_channels[1], generator)
@@ -242,5 +226,5 @@ class RadialConv(nn.Module):
                 f"`geometry` must have {len(self.scalar_filters)} terms in {self.dim} dimensions, got "
                 f"{geometry.num_terms} in {geometry.dim}."
             )
-        check_shape("features", features.shape, (geometry.num_senders, num_values(self.in_channels, self.dim)))
+        check_shape("features", features.shape, (geometry.num_senders, self.in_channels.num_values(self.dim)))
         check_kind(geometry.edges.distances, features=features, filters=self.scalar_filters)

@@ -104,13 +104,12 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _draw_axis(axes: Axes, explanation: Explanation, axis: int, spacing: float) -> None:
     """The velocity component along the axis for a scalar target, the density for the component along the axis."""
     learned, analytic = explanation["learned_on_axes"][axis], explanation["analytic_on_axes"][axis]
-    is_vector = learned.shape[2] > 1
-    feature, component = (-1, axis) if is_vector else (1 + axis, 0)
+    names, name = list(explanation["feature_names"]), "xyz"[axis]
+    feature, component = (names.index("ρ"), axis) if learned.shape[2] > 1 else (names.index(f"v_{name}"), 0)
     line = explanation["line"] / spacing
     axes.plot(line, analytic[:, feature, component], color=_ANALYTIC, lw=3, alpha=0.25, label="analytic: ∇W")
     axes.plot(line, learned[:, feature, component], color=_LEARNED, lw=1.4, label="learned")
-    name = "xyz"[axis]
-    axes.set(xlabel=f"offset along {name} [spacings]", title=f"{explanation['feature_names'][feature]} along {name}")
+    axes.set(xlabel=f"offset along {name} [spacings]", title=f"{names[feature]} along {name}")
     axes.legend(fontsize=8)
 
 

@@ -30,6 +30,7 @@ from cconv.study.stages.initialization import train_unstopped
 from cconv.study.stages.search import adaptive_search, random_search, spend_otherwise
 from cconv.study.stages.select import select
 from cconv.study.stages.session import Progress, Session
+from cconv.tasks.features import WALLS
 from cconv.validation import check_setting
 
 RAY_FILES = "ray"  # folder in that of the run
@@ -162,7 +163,7 @@ def _session(
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
-        space = fixed(space, "boundary")  # nothing to search where there are no walls
+        space = fixed(space, WALLS)  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
     searches = [name for name, stage in study.stages.items() if stage.kind in ("random", "adaptive")]

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from cconv.data.targets import Sample
-from cconv.models.model import FieldGeometry
+from cconv.models.model import FrameGeometry
+from cconv.tasks.samples import Sample
 
 
 class GeometryCache:
@@ -16,12 +16,12 @@ class GeometryCache:
         max_bytes: Memory to use at most.
     """
 
-    def __init__(self, build: Callable[..., FieldGeometry], max_bytes: int):
+    def __init__(self, build: Callable[..., FrameGeometry], max_bytes: int):
         self._build = build
         self._bytes_left = max_bytes
-        self._kept: dict[tuple[str, int], FieldGeometry] = {}
+        self._kept: dict[tuple[str, int], FrameGeometry] = {}
 
-    def __call__(self, sample: Sample) -> FieldGeometry:
+    def __call__(self, sample: Sample) -> FrameGeometry:
         """Geometry of `sample`."""
         key = (sample.trajectory, sample.frame)
         if key in self._kept:

@@ -9,10 +9,10 @@ from itertools import islice
 import torch
 import torch.nn.functional as F
 
-from cconv.data.targets import Sample
 from cconv.errors import check_choice
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.models.model import FieldModel
+from cconv.models.model import Model
+from cconv.tasks.samples import Sample
 from cconv.training.batches import batches
 from cconv.training.geometry_cache import GeometryCache
 from cconv.training.progress import Progress, begin
@@ -46,7 +46,7 @@ class TrainingState:
 
 
 def train(
-    model: FieldModel,
+    model: Model,
     train_samples: Sequence[Sample],
     valid_samples: Sequence[Sample],
     *,
@@ -104,9 +104,7 @@ def train(
             return
 
 
-def _update(
-    model: FieldModel, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache
-) -> float:
+def _update(model: Model, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache) -> float:
     """One step on the mean over the frames of a batch; frame by frame, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     total = 0.0

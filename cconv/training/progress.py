@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from cconv.errors import DataError
 from cconv.files import parse_json
-from cconv.models.model import FieldModel
+from cconv.models.model import Model
 from cconv.validation import Real, StrictModel, Whole
 
 
@@ -36,12 +36,12 @@ class Progress:
     seconds: float = 0.0
 
 
-def begin(model: FieldModel) -> Progress:
+def begin(model: Model) -> Progress:
     """The start of a training."""
     return Progress(torch.optim.Adam(model.parameters()))
 
 
-def save_progress(path: Path, model: FieldModel, progress: Progress) -> None:
+def save_progress(path: Path, model: Model, progress: Progress) -> None:
     """Write weights, Adam's moments and counts to one safetensors file, whole or not at all."""
     part = path.with_name(f".{path.name}-{os.getpid()}")
     counts = {"updates": progress.updates, "seconds": progress.seconds}
@@ -56,7 +56,7 @@ def save_progress(path: Path, model: FieldModel, progress: Progress) -> None:
         part.unlink(missing_ok=True)
 
 
-def load_progress(path: Path, model: FieldModel) -> Progress:
+def load_progress(path: Path, model: Model) -> Progress:
     """Set the model's weights to those of the file, and give its optimiser and counts.
 
     Raises:

@@ -32,12 +32,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from cconv import open_dataset, radius_graph
-from cconv.data.targets import make_sample
-from cconv.models.model import NetworkConfig, build_field_model
+from cconv.models.model import build_model
 from cconv.neighbors import Edges
+from cconv.networks import ConvNetSettings
 from cconv.nn import ConvGeometry, continuous_conv
 from cconv.ops import general
-from cconv.sph import CubicSpline
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
 HAS_OPEN3D = find_spec("open3d") is not None
 QUANTITIES = ("forward", "forward + backward")
@@ -180,9 +181,9 @@ class Open3DNet(nn.Module):
 def training_steps(folder: Path) -> dict[str, Callable[[], None]]:
     """One training step each of the published network on a frame, neighbour search included."""
     dataset = open_dataset(folder, mass=0.125, particle_spacing=0.05, frame_dt=1 / 60)
-    kernel = CubicSpline(0.05, 3)
-    sample = make_sample(dataset.trajectory("train", 0)[20], dataset.scene, "density_rate", kernel)
-    model = build_field_model(NetworkConfig(), dataset.scene, "density_rate", "cubic_spline", 0.05, [sample])
+    task = task_named("density_rate")
+    sample = make_sample(dataset.trajectory("train", 0)[20], dataset.scene, task)
+    model = build_model(ConvNetSettings(), task, task.features, dataset.scene, [sample])
     inputs, target = sample.inputs, model.standardize_target(sample.target)
 
     def step(parameters: nn.Module, optimizer: torch.optim.Optimizer, predict: Callable[[], Tensor]) -> None:

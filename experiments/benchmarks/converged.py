@@ -58,8 +58,8 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
     training = study.training.model_copy(update={"updates": updates})
     folder = TrialFolder(place)
     trial = run_trial(
-        problem, hyperparameters(study)[model], study.network, training, folder, stage="train", init_seed=seed,
-        data_seed=study.seeds.data, provenance=provenance(study, dataset),
+        problem, hyperparameters(study)[model], study.configuration._replace(training=training), folder, stage="train",
+        init_seed=seed, data_seed=study.seeds.data, provenance=provenance(study, dataset),
     )  # fmt: skip
     for _ in track(trial, f"{model}, seed {seed}", total=updates // training.evaluate_every):
         pass

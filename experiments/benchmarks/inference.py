@@ -23,36 +23,46 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from cconv.data.targets import Sample, make_sample
 
 from cconv import open_dataset, radius_graph
-from cconv.data.targets import Sample, make_sample
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
+from cconv.evaluation.cost import neighbor_density
 from cconv.models.checkpoint import load_model, save_model
-from cconv.models.model import FieldModel, NetworkConfig, build_field_model
-from cconv.sph import CubicSpline
+from cconv.models.model import Model, NetworkConfig, build_model
+from cconv.nn.kinds import Kinds
+from cconv.study.declared.configuration import DEFAULTS, configure
+from cconv.tasks import task_named
+from cconv.tasks.features import WALLS, kinds_of
 
 SPACING = 0.05
 DIM = 3
-LAYER = {"layers": 1, "basis": "radial", "message": "difference", "relative_cutoff": 2.0, "window": "none"}
+LAYERS = {"architecture": "radial_net"}
+LAYER = LAYERS | {"layers": 1, "message": "difference", "relative_cutoff": 2.0, "window": "none"}
 COMPARED = {
     "published network": {},
     "radial layer": LAYER,
-    "radial layer, no walls": LAYER | {"boundary": False, "density": False},
+    "radial layer, no walls": LAYER | {"walls": False, "density": False},
 }
 CHECKED = COMPARED | {
     "grid layer": {"layers": 1},
     "grid layer, identity": {"layers": 1, "mapping": "identity", "window": "none"},
-    "grid layer, K = 6, no walls": {"layers": 1, "kernel_size": 6, "boundary": False},
+    "grid layer, K = 6, no walls": {"layers": 1, "kernel_size": 6, "walls": False},
     "2 grid layers of 8": {"layers": 2, "first_channels": 8},
     "2 grid layers, nearest cell": {"layers": 2, "first_channels": 16, "interpolation": "nearest_neighbor"},
     "3 grid layers of 16": {"layers": 3, "first_channels": 16, "hidden_channels": 16},
-    "3 grid layers, R = 1.5, no walls": {"layers": 3, "mapping": "identity", "relative_cutoff": 1.5, "boundary": False},
+    "3 grid layers, R = 1.5, no walls": {"layers": 3, "mapping": "identity", "relative_cutoff": 1.5, "walls": False},
     "4 grid layers, K = 3": {"kernel_size": 3, "first_channels": 16, "hidden_channels": 32},
-    "radial layer, poly6, R = 2.5": LAYER | {"window": "poly6", "relative_cutoff": 2.5, "boundary": False},
-    "2 radial layers of 8": {"layers": 2, "basis": "radial", "first_channels": 8},
-    "2 radial layers of 32, no walls": {"layers": 2, "basis": "radial", "first_channels": 32, "boundary": False},
-    "3 radial layers of 8": {"layers": 3, "basis": "radial", "first_channels": 8, "hidden_channels": 8},
+    "radial layer, poly6, R = 2.5": LAYER | {"window": "poly6", "relative_cutoff": 2.5, "walls": False},
+    "2 radial layers of 8": LAYERS | {"layers": 2, "first_channels": 8},
+    "2 radial layers of 32, no walls": {
+        "layers": 2,
+        "architecture": "radial_net",
+        "first_channels": 32,
+        "walls": False,
+    },
+    "3 radial layers of 8": LAYERS | {"layers": 3, "first_channels": 8, "hidden_channels": 8},
 }
 SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000, 50_000) for periodic in (False, True)]
 SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
@@ -64,11 +74,12 @@ def frame_of(folder: Path) -> tuple[Scene, Frame]:
 
 
 def sample_of(scene: Scene, frame: Frame) -> Sample:
-    return make_sample(frame, scene, "density_rate", CubicSpline(SPACING, DIM))
+    return make_sample(frame, scene, task_named("density_rate"))
 
 
-def model_of(settings: Mapping, scene: Scene, sample: Sample) -> FieldModel:
-    return build_field_model(NetworkConfig(**settings), scene, "density_rate", "cubic_spline", SPACING, [sample]).eval()
+def model_of(settings: Mapping, scene: Scene, sample: Sample) -> Model:
+    features, network, _ = configure(settings, DEFAULTS)
+    return build_model(network, task_named("density_rate"), features, scene, [sample]).eval()
 
 
 def cloud(dim: int, count: int, periodic: bool) -> tuple[torch.Tensor, Box]:
@@ -98,7 +109,7 @@ class Calls:
             self.calls[json.dumps(search)] = lambda positions=positions, box=box: self.search(positions, box)
 
     @torch.no_grad()
-    def predict(self, model: FieldModel, inputs) -> tuple[float, float]:
+    def predict(self, model: Model, inputs) -> tuple[float, float]:
         start = time.perf_counter()
         geometry = model.geometry(inputs)
         middle = time.perf_counter()
@@ -180,13 +191,13 @@ def ratio(numerators: list[float], denominators: list[float]) -> dict[str, float
 
 def measure_checks(data: Path, rounds: int) -> dict:
     """Growth of the compared models, and the cost model's predictions for many."""
-    from cconv.evaluation.cost import measure_costs, measure_growth, surroundings_of
-    from cconv.evaluation.cost_model import estimate
+
+    from cconv.evaluation.cost import measure_costs, measure_growth
     from cconv.evaluation.time_model import check_cost_model
 
     scene, frame = frame_of(data)
     sample = sample_of(scene, frame)
-    around = surroundings_of(sample.inputs, 2.0)
+    around = neighbor_density(sample.inputs, 2.0)
     with tempfile.TemporaryDirectory() as folder:
         saved = {name: Path(folder) / str(place) for place, name in enumerate(CHECKED)}
         for name, path in saved.items():
@@ -199,21 +210,15 @@ def measure_checks(data: Path, rounds: int) -> dict:
             load_model,
             [frame],
             scene,
-            task="density_rate",
-            kernel=CubicSpline(SPACING, DIM),
+            task=task_named("density_rate"),
             threads=1,
             repeats=max(2, rounds // 2),
         )
-    counted = {
-        name: estimate(
-            NetworkConfig(**settings).model_dump(),
-            dim=DIM,
-            vector_output=False,
-            boundary_channels=DIM,
-            surroundings=around,
-        )
-        for name, settings in CHECKED.items()
-    }
+    counted = {}
+    for name, settings in CHECKED.items():
+        features, network, _ = configure(settings, DEFAULTS)
+        walls = Kinds(0, 1) if WALLS in features else None
+        counted[name] = network.count(kinds_of(features), walls, Kinds(1, 0), DIM, around)
     check = check_cost_model(counted, {name: cost.us_per_particle for name, cost in costs.items()})
     return {
         "growth": {name: asdict(each) for name, each in growth.items()},

@@ -6,10 +6,16 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from cconv.data.features import fluid_state
-from cconv.data.targets import TASKS
 from cconv.domain import Box
 from cconv.neighbors import radius_graph
+from cconv.tasks import task_named
+from cconv.tasks.features import fluid_state
+
+
+def single(state):
+    """A state in float32, as networks compute."""
+    values = {name: getattr(state, name).float() for name in ("positions", "velocities", "masses")}
+    return replace(state, **values).knowing(state.edges.to(torch.float32), state.densities.float())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,10 +34,10 @@ class Analytic:
 
     def state(self, frame, scene, dtype):
         state = fluid_state(frame, scene.box, self.kernel)
-        return state.single() if dtype == torch.float32 else state
+        return single(state) if dtype == torch.float32 else state
 
     def field(self, state, frame, scene):
-        return TASKS[self.task](state, self.kernel)
+        return task_named(self.task).field(state)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +87,8 @@ def close_pairs_times(factor):
     def fault(field, state, frame, scene, usual, model):
         close = state.edges.distances < 0.2 * usual.spacing
         displacements = torch.where(close[:, None], factor * state.edges.displacements, state.edges.displacements)
-        spoiled = replace(state, edges=replace(state.edges, displacements=displacements))
-        return TASKS[model.task](spoiled, model.kernel)
+        spoiled = state.knowing(replace(state.edges, displacements=displacements), state.densities)
+        return task_named(model.task).field(spoiled)
 
     return fault
 
@@ -176,7 +182,7 @@ def wrong_in_compressed_clumps(field, state, frame, scene, usual, model):
 def ignores_periodic_axes(field, state, frame, scene, usual, model):
     open_box = Box(scene.box.lower, scene.box.upper, False)
     state = model.state(frame, replace(scene, box=open_box), state.positions.dtype)
-    return TASKS[model.task](state, model.kernel)
+    return task_named(model.task).field(state)
 
 
 def saturates(field, state, frame, scene, usual, model):

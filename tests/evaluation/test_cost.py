@@ -2,9 +2,8 @@ import math
 import statistics
 
 import pytest
-from systems import kernel, periodic_frame, periodic_scene, problem
+from systems import configured, periodic_frame, periodic_scene, problem
 
-from cconv.data.features import fluid_state, make_inputs
 from cconv.evaluation import cost as costs
 from cconv.evaluation.cost import (
     ANALYTIC,
@@ -14,15 +13,17 @@ from cconv.evaluation.cost import (
     measure_growth,
 )
 from cconv.models.checkpoint import load_model, save_model
-from cconv.models.model import FieldConfig, NetworkConfig
+from cconv.models.model import ModelConfig
 from cconv.neighbors import radius_graph
-from cconv.sph import CubicSpline
+from cconv.nn.kinds import Kinds
+from cconv.sph.operators import density as sum_densities
+from cconv.tasks import task_named
 
 
 def test_flops_of_one_layer_counted_by_hand(generator):
     """4 features to 1 output: multiply first (K² · 4 a particle), read 4 cells an edge, add the dense layer."""
     given = problem(generator)
-    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    model = given.build_model(configured(layers=1, kernel_size=3), 0)
     inputs = given.valid_samples[0].inputs
     edges = len(model.geometry(inputs).fluid.reads.senders)
     expected = 2 * (4 * edges / 64 * 1 + 9 * 4 * 1) + 2 * 4
@@ -33,9 +34,7 @@ def test_wider_networks_cost_more(generator):
     given = problem(generator)
     inputs = given.valid_samples[0].inputs
     counts = [
-        flops_per_particle(
-            given.build_model(NetworkConfig(layers=3, first_channels=4, hidden_channels=width), 0), inputs
-        )
+        flops_per_particle(given.build_model(configured(layers=3, first_channels=4, hidden_channels=width), 0), inputs)
         for width in (4, 8, 16)
     ]
     assert counts == sorted(counts)
@@ -44,7 +43,7 @@ def test_wider_networks_cost_more(generator):
 def measured(models, generator, repeats=4, task="density_rate"):
     scene = periodic_scene()
     frames = [periodic_frame(generator) for _ in range(2)]
-    return measure_costs(models, load_model, frames, scene, task=task, kernel=kernel(scene), threads=1, repeats=repeats)
+    return measure_costs(models, load_model, frames, scene, task=task_named(task), threads=1, repeats=repeats)
 
 
 def test_measured_costs_are_consistent(generator, tmp_path):
@@ -67,7 +66,7 @@ def test_models_and_the_analytic_field_take_turns_on_the_same_frames(generator, 
         costs, "_time_prediction", lambda model, frame, scene: (seen.append(("model", frame)), (0, 1))[1]
     )
     monkeypatch.setattr(
-        costs, "_time_analytic", lambda task, sums, frame, scene: (seen.append((task, frame)), (0, 1))[1]
+        costs, "_time_analytic", lambda task, sums, frame, scene: (seen.append((task.name, frame)), (0, 1))[1]
     )
     measured(saved_models(generator, tmp_path), generator, repeats=3)
     turns = [tuple(name for name, _ in seen[k : k + 3]) for k in range(0, 12, 3)]
@@ -82,47 +81,49 @@ def test_the_sum_of_densities_is_timed_where_a_model_needs_it(generator, monkeyp
     """What is timed is the prediction from a stored frame, so the density is summed once for the model with density."""
     given, sums = problem(generator), []
     monkeypatch.setattr(
-        "cconv.models.model.fluid_state", lambda *arguments: (sums.append(1), fluid_state(*arguments))[1]
+        "cconv.tasks.features.density", lambda *arguments: (sums.append(1), sum_densities(*arguments))[1]
     )
     for density in (False, True):
-        model = given.build_model(NetworkConfig(layers=1, kernel_size=3, density=density), 0)
+        model = given.build_model(configured(layers=1, kernel_size=3, density=density), 0)
         costs._time_prediction(model, periodic_frame(generator), periodic_scene())
         assert len(sums) == density
 
 
-def field(dim, boundary_channels, spacing=0.1):
-    return FieldConfig(
+def field(dim, walls=None, spacing=0.1):
+    scalars, vectors = walls or Kinds(0, 0)
+    return ModelConfig(
         task="density_rate",
-        dim=dim,
-        particle_spacing=spacing,
         kernel="cubic_spline",
         relative_smoothing_length=1.0,
-        boundary_channels=boundary_channels,
-        network=NetworkConfig(layers=1),
+        dim=dim,
+        particle_spacing=spacing,
+        features=("one", "density", "velocity", "walls"),
+        wall_scalars=scalars,
+        wall_vectors=vectors,
+        network=configured(layers=1).network,
     )
 
 
-@pytest.mark.parametrize("channels", [0, 1, 3])
+@pytest.mark.parametrize("walls", [None, Kinds(1, 0), Kinds(0, 1)])
 @pytest.mark.parametrize("count", [1, 100, 512])
-def test_a_block_is_fluid_of_the_spacing_on_a_wall(count, channels):
-    frame, scene = fluid_block(count, field(3, channels))
-    block = make_inputs(fluid_state(frame, scene.box, CubicSpline(0.1, 3)), frame.boundary, scene)
-    assert block.num_particles == len(block.features) == count
+def test_a_block_is_fluid_of_the_spacing_on_a_wall(count, walls):
+    frame, scene = fluid_block(count, field(3, walls))
+    block = task_named("density_rate").inputs(frame, scene, ("one", "velocity"))
+    assert block.num_particles == len(block.features.scalars) == count
     if count == 512:
         neighbors = radius_graph(block.positions, 1.2).row_splits.diff()
         assert neighbors.double().mean() == pytest.approx(6 * 7 / 8, rel=0.1)  # of a lattice of 8 by 8 by 8
-    if channels:
-        assert block.boundary_features.shape == (len(block.boundary_positions), channels)
-        near = radius_graph(block.boundary_positions, 1.3, queries=block.positions)
-        assert len(near) >= len(block.boundary_positions) * min(1, count / len(block.boundary_positions)) * 0.9
-    else:
-        assert block.boundary_positions is None
+    assert block.wall_kinds == walls
+    if walls:
+        points = len(block.wall_positions)
+        near = radius_graph(block.wall_positions, 1.3, queries=block.positions)
+        assert len(near) >= points * min(1, count / points) * 0.9
 
 
 def saved_models(generator, tmp_path):
     given = problem(generator)
     for name, layers in (("small", 1), ("large", 3)):
-        network = NetworkConfig(layers=layers, first_channels=4, hidden_channels=4, kernel_size=3)
+        network = configured(layers=layers, first_channels=4, hidden_channels=4, kernel_size=3)
         save_model(given.build_model(network, 0), tmp_path / name, {})
     return {name: tmp_path / name for name in ("small", "large")}
 
@@ -131,7 +132,7 @@ def test_growth_is_measured_at_every_size(generator, tmp_path):
     growth = measure_growth(
         saved_models(generator, tmp_path),
         load_model,
-        analytic=field(2, 0),
+        analytic=field(2),
         sizes=(30, 60, 2000),
         threads=1,
         repeats=3,

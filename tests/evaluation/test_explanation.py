@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from systems import kernel, periodic_frame, periodic_scene
+from systems import configured, kernel, model_of, periodic_frame, periodic_scene
 
-from cconv.data.targets import make_sample
 from cconv.evaluation.explanation import error_distribution, explain, first_layer_filters
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.model import NetworkConfig, build_field_model
+from cconv.study.declared.configuration import configure
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
 SIDE = 12
-RADIAL = NetworkConfig(layers=1, basis="radial", message="difference", relative_cutoff=2.0)
-GRID = NetworkConfig(
+RADIAL = configured(layers=1, architecture="radial_net", message="difference", relative_cutoff=2.0)
+GRID = configured(
     layers=1, kernel_size=6, message="difference", relative_cutoff=2.0, mapping="identity", window="poly6"
 )
 
@@ -24,13 +25,13 @@ def samples_of(generator, task, count=3):
     scene = periodic_scene(SIDE)
     frames = [periodic_frame(generator, SIDE) for _ in range(count)]
     gases = [replace(frame, positions=torch.rand(SIDE**2, 2, generator=generator)) for frame in frames]
-    return [make_sample(frame, scene, task, kernel(scene)) for frame in gases]
+    return [make_sample(frame, scene, task_named(task)) for frame in gases]
 
 
 def built(network, samples, task="density_rate"):
     scene = periodic_scene(SIDE)
     generator = torch.Generator().manual_seed(0)
-    return build_field_model(network, scene, task, "cubic_spline", 1 / SIDE, samples, generator).eval()
+    return model_of(network, scene, task, samples, generator).eval()
 
 
 def fitted(network, samples, task="density_rate"):
@@ -72,12 +73,13 @@ def test_analytic_filters_are_the_printed_formulas(generator):
 def test_a_layer_answers_with_its_filters(generator):
     """A grid of one cell is the window times the same weights at every place, in the units of the data."""
     samples = samples_of(generator, "density_rate", 1)
-    model = built(GRID.model_copy(update={"kernel_size": 1}), samples)
+    model = built(configure({"kernel_size": 1}, GRID), samples)
     filters = first_layer_filters(model, samples[0])
     inside = (1 - (filters["line"] / model.cutoff) ** 2).clip(0) ** 3
     weights = model.network.convs[0].filters.detach().double()[0, 0]
     units = samples[0].inputs.units
-    per_unit = torch.tensor([units.velocity, units.velocity, units.density])[:, None]
+    per_unit = torch.tensor([units.density, units.velocity, units.velocity])[:, None]
+    weights = weights[[2, 0, 1]]  # of the published order, velocity and density
     weights = weights / model.feature_scale[1:, None] * model.target_scale * samples[0].target_unit / per_unit
     weights = torch.cat([torch.zeros(1, 1), weights]).numpy()  # differences of the constant are 0
     for axis in range(2):
@@ -98,7 +100,7 @@ def test_radial_filters_are_the_same_in_all_directions_and_grids_are_not(generat
 def test_normalised_filters_are_divided_by_the_mean_sum_of_windows(generator):
     samples = samples_of(generator, "density_rate", 1)
     plain, normalized = (
-        first_layer_filters(built(GRID.model_copy(update={"normalize": value}), samples), samples[0])
+        first_layer_filters(built(configure({"normalize": value}, GRID), samples), samples[0])
         for value in (False, True)
     )
     ratio = plain["learned_on_axes"] / np.where(normalized["learned_on_axes"] == 0, 1, normalized["learned_on_axes"])
@@ -107,11 +109,11 @@ def test_normalised_filters_are_divided_by_the_mean_sum_of_windows(generator):
     assert 1 < sums.mean() < 12
 
 
-@pytest.mark.parametrize("basis", ["grid", "radial"])
-def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(generator, basis):
+@pytest.mark.parametrize("architecture", ["conv_net", "radial_net"])
+def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(generator, architecture):
     samples = samples_of(generator, "density_rate", 1)
-    wide = NetworkConfig(layers=2, basis=basis, first_channels=24, hidden_channels=8, relative_cutoff=2.0)
-    narrow = wide.model_copy(update={"first_channels": 1})
+    wide = configured(layers=2, architecture=architecture, first_channels=24, hidden_channels=8, relative_cutoff=2.0)
+    narrow = configure({"first_channels": 1}, wide)
     found = [first_layer_filters(built(network, samples), samples[0]) for network in (narrow, wide)]
     assert all(filters["is_combined"] for filters in found)
     assert 0 <= found[1]["unexplained"] < found[0]["unexplained"] <= 1
@@ -119,7 +121,7 @@ def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(genera
 
 def test_models_without_density_or_with_walls_are_explained(generator):
     samples = samples_of(generator, "density_rate", 1)
-    filters = first_layer_filters(built(RADIAL.model_copy(update={"density": False}), samples), samples[0])
+    filters = first_layer_filters(built(configure({"density": False}, RADIAL), samples), samples[0])
     assert abs(filters["learned_on_axes"][:, :, -1]).max() == 0
     walled = replace(
         samples[0],

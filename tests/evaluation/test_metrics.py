@@ -4,11 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from systems import problem
+from systems import configured, problem
 
 from cconv.evaluation.metrics import blocks_of_errors, own_variance, per_frame_normalized_mse
 from cconv.models.errors import FrameError, frame_errors, mean_predictor_error, normalized_mse
-from cconv.models.model import NetworkConfig
 
 
 def error(value, trajectory="0", frame=0, particles=10):
@@ -23,7 +22,7 @@ def error(value, trajectory="0", frame=0, particles=10):
 
 def test_predicting_the_training_mean_has_error_one_on_the_training_split(generator):
     given = problem(generator)
-    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    model = given.build_model(configured(layers=1, kernel_size=3), 0)
     for parameter in model.parameters():
         torch.nn.init.zeros_(parameter)
     assert normalized_mse(frame_errors(model, given.train_samples)) == pytest.approx(1, rel=1e-5)
@@ -46,7 +45,7 @@ def test_the_mean_predictor_scores_one_on_the_training_split_and_its_own_on_othe
 
 def test_per_frame_error_divides_by_the_frames_own_variance(generator):
     given = problem(generator)
-    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    model = given.build_model(configured(layers=1, kernel_size=3), 0)
     entry = frame_errors(model, given.valid_samples[:1])[0]
     target = given.valid_samples[0].target * given.valid_samples[0].target_unit
     physical = (model.predict(given.valid_samples[0].inputs) - target).square().mean() / target.var(correction=0)
@@ -77,7 +76,7 @@ def test_frames_with_a_constant_target_do_not_count_in_the_per_frame_error():
 
 def test_an_error_by_the_own_variance_is_1_for_the_own_mean(generator):
     given = problem(generator)
-    model = given.build_model(NetworkConfig(layers=1, kernel_size=3), 0)
+    model = given.build_model(configured(layers=1, kernel_size=3), 0)
     calm = [replace(sample, target=0.1 * sample.target + 3.0) for sample in given.valid_samples]
     targets = torch.cat([sample.target for sample in calm]).double()
     own_mean = (targets.mean() - targets).square().mean() / float(model.target_scale) ** 2

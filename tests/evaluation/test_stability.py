@@ -9,8 +9,8 @@ import pytest
 import torch
 from evaluation.flows import SPACING, flow
 from evaluation.planted_faults import FAULTS, Analytic, Spoiled, Usual
+from systems import configured, model_of
 
-from cconv.data.targets import make_sample
 from cconv.evaluation import probes as probing
 from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import (
@@ -23,11 +23,12 @@ from cconv.evaluation.stability import (
     stressed_error,
 )
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.model import NetworkConfig, build_field_model
 from cconv.neighbors import radius_graph
 from cconv.sph import CubicSpline
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
-NETWORK = NetworkConfig(layers=1, basis="radial", message="difference", relative_cutoff=2.0)
+NETWORK = configured(layers=1, architecture="radial_net", message="difference", relative_cutoff=2.0)
 TASKS = ("density_rate", "density_gradient")
 SCENES = [
     {"dim": dim, "walls": walls, "periodic": periodic}
@@ -41,7 +42,7 @@ def system(task, dim, walls, periodic):
     """Trajectory, scene, kernel and probes of a flow."""
     trajectory, scene = flow(dim, walls=walls, periodic=periodic, frames=7 if dim == 2 else 3)
     kernel = CubicSpline(SPACING, dim)
-    return trajectory, scene, kernel, make_probes([trajectory], scene, task, kernel)
+    return trajectory, scene, kernel, make_probes([trajectory], scene, task_named(task))
 
 
 def usual_of(trajectory, scene, probes):
@@ -159,8 +160,8 @@ def model():
 
 
 def solved(trajectory, scene, kernel):
-    samples = [make_sample(frame, scene, "density_rate", kernel) for frame in trajectory]
-    model = build_field_model(NETWORK, scene, "density_rate", "cubic_spline", SPACING, samples)
+    samples = [make_sample(frame, scene, task_named("density_rate")) for frame in trajectory]
+    model = model_of(NETWORK, scene, "density_rate", samples)
     solve_closed_form(model, samples)
     return model.eval()
 
@@ -171,10 +172,10 @@ def probes_of_model():
 
 def test_an_untrained_model_is_not_stable():
     trajectory, scene, kernel, probes = system("density_rate", dim=2, walls=True, periodic=False)
-    samples = [make_sample(frame, scene, "density_rate", kernel) for frame in trajectory]
-    network = NetworkConfig(layers=2, first_channels=4, hidden_channels=4)
+    samples = [make_sample(frame, scene, task_named("density_rate")) for frame in trajectory]
+    network = configured(layers=2, first_channels=4, hidden_channels=4)
     generator = torch.Generator().manual_seed(0)
-    model = build_field_model(network, scene, "density_rate", "cubic_spline", SPACING, samples, generator)
+    model = model_of(network, scene, "density_rate", samples, generator)
     checks = measure_stability({"it": ModelPredictor(model)}, probes)
     assert not checks["stable"]
     assert any("regime bulk" in line for line in checks["failures"])
@@ -257,7 +258,7 @@ def test_a_trajectory_at_rest_is_judged_too():
     trajectory, scene = flow(2, walls=False, periodic=True)
     resting = replace(trajectory, velocities=torch.zeros_like(trajectory.velocities))
     kernel = CubicSpline(SPACING, 2)
-    probes = make_probes([resting], scene, "density_rate", kernel)
+    probes = make_probes([resting], scene, task_named("density_rate"))
     assert measure_stability({"it": Analytic(task="density_rate", kernel=kernel)}, probes)["stable"]
     constant = Spoiled(task="density_rate", kernel=kernel, usual=None, fault=lambda field, *others: field + 1)
     assert not measure_stability({"it": constant}, probes)["stable"]
@@ -270,7 +271,7 @@ def test_the_number_of_frames_is_bounded():
         positions=trajectory.positions.repeat(20, 1, 1),
         velocities=trajectory.velocities.repeat(20, 1, 1),
     )
-    probes = make_probes([long, replace(long, name="other")], scene, "density_rate", CubicSpline(SPACING, 2))
+    probes = make_probes([long, replace(long, name="other")], scene, task_named("density_rate"))
     assert len(probes.plain) == probing.REGIME_FRAMES
     assert len(probes.rollout.frames) == probing.ROLLOUT_FRAMES
     assert len({probe.origin for probe in probes.stressed}) == probing.STRESSED_FRAMES

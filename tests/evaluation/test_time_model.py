@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from cconv.errors import ConfigError
-from cconv.evaluation.cost_model import Estimate
 from cconv.evaluation.time_model import TimeModel, check_cost_model
+from cconv.networks.counting import CountedCost
 
 TRUE = TimeModel(us_per_particle=0.5, us_per_flop=2e-5, us_per_byte=3e-4)
 
@@ -11,7 +11,7 @@ TRUE = TimeModel(us_per_particle=0.5, us_per_flop=2e-5, us_per_byte=3e-4)
 def estimates(count=12, seed=0):
     draws = np.exp(np.random.default_rng(seed).uniform(np.log(1e3), np.log(1e6), (count, 2)))
     return {
-        f"model {place}": Estimate(flops_per_particle=flops, bytes_per_particle=0.3 * moved)
+        f"model {place}": CountedCost(flops_per_particle=flops, bytes_per_particle=0.3 * moved)
         for place, (flops, moved) in enumerate(draws)
     }
 

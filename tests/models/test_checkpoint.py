@@ -6,18 +6,17 @@ import sys
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from systems import problem
+from systems import configured, problem
 
 from cconv import load_model
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import read_card, save_model
-from cconv.models.model import NetworkConfig
 
 
 @pytest.fixture
 def saved(generator, tmp_path):
     given = problem(generator)
-    model = given.build_model(NetworkConfig(layers=2, first_channels=4, kernel_size=3), 0)
+    model = given.build_model(configured(layers=2, first_channels=4, kernel_size=3), 0)
     save_model(model, tmp_path / "checkpoint", {"valid_normalized_mse": 0.5})
     return given, model, tmp_path / "checkpoint"
 
@@ -39,7 +38,7 @@ def test_saving_again_replaces_and_leaves_nothing_behind(saved):
 def test_a_kill_at_any_time_leaves_a_whole_model(saved):
     """A child process replaces the model and ends itself at its first file operation, then at its second, and so on."""
     given, model, folder = saved
-    other = given.build_model(model.config.network, 1)
+    other = given.build_model(configured(**model.config.network.model_dump()), 1)
     known = [each.predict(given.valid_samples[0].inputs) for each in (model, other)]
     for operation in itertools.count(1):
         child = os.fork()
@@ -101,7 +100,7 @@ def test_an_unknown_setting_is_named(saved):
         load_model(saved[2])
 
 
-@pytest.mark.parametrize("version", [None, 1, 3, "2"])
+@pytest.mark.parametrize("version", [None, 1, 2, 4, "3"])
 def test_a_checkpoint_of_another_format_is_refused_with_the_way_out(saved, version):
     path = saved[2] / "config.json"
     config = json.loads(path.read_text()) | {"format": version}
@@ -109,7 +108,7 @@ def test_a_checkpoint_of_another_format_is_refused_with_the_way_out(saved, versi
         del config["format"]
     path.write_text(json.dumps(config))
     with pytest.raises(
-        ConfigError, match=r"config\.json: `format` is .*, and this version reads 2.*fit the model again"
+        ConfigError, match=r"config\.json: `format` is .*, and this version reads 3.*fit the model again"
     ):
         load_model(saved[2])
 
@@ -146,7 +145,7 @@ def test_a_huge_network_is_refused_before_anything_is_allocated(saved):
     with pytest.raises(ConfigError, match="the network would have .* learned values, more than 100,000,000"):
         load_model(saved[2])
     with pytest.raises(ConfigError, match="the network would have"):
-        saved[0].build_model(NetworkConfig.model_validate(config["network"]), 0)
+        saved[0].build_model(configured(**config["network"]), 0)
 
 
 def test_a_huge_list_of_contents_is_refused(saved):

@@ -2,15 +2,15 @@ import pytest
 import torch
 
 import cconv
-from cconv.data.targets import iterate_samples
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.closed_form import fit_closed_form
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.models.model import NetworkConfig
-from cconv.sph import CubicSpline
+from cconv.networks import ConvNetSettings, RadialNetSettings
+from cconv.tasks import task_named
+from cconv.tasks.samples import iterate_samples
 
-GRID = NetworkConfig(layers=1, message="difference", relative_cutoff=2.0, kernel_size=4)
+GRID = ConvNetSettings(layers=1, message="difference", relative_cutoff=2.0, kernel_size=4)
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +19,7 @@ def flow(flow_folder):
 
 
 def valid_error(model, flow, task):
-    kernel = CubicSpline(flow.scene.particle_spacing, flow.scene.dim)
-    return normalized_mse(frame_errors(model, list(iterate_samples(flow, "valid", task, kernel))))
+    return normalized_mse(frame_errors(model, list(iterate_samples(flow, "valid", task_named(task)))))
 
 
 @pytest.mark.parametrize(("task", "bound"), [("density_rate", 1e-3), ("density_gradient", 5e-2)])
@@ -37,9 +36,7 @@ def test_more_terms_are_more_accurate(flow):
         valid_error(
             fit_closed_form(
                 flow,
-                network=NetworkConfig(
-                    layers=1, basis="radial", message="difference", relative_cutoff=2.0, radial_terms=terms
-                ),
+                network=RadialNetSettings(layers=1, message="difference", relative_cutoff=2.0, radial_terms=terms),
             ),
             flow,
             "density_rate",
@@ -65,7 +62,7 @@ def test_public_names():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"network": NetworkConfig()}, "`network.layers` must be 1"),
+        ({"network": ConvNetSettings()}, "`network.layers` must be 1"),
         ({"ridge": -1.0}, "`ridge` must be at least 0"),
         ({"task": "density"}, "task"),
     ],

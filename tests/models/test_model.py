@@ -1,23 +1,23 @@
-import json
 from dataclasses import replace
 
 import pytest
 import torch
-from systems import kernel, periodic_frame, periodic_scene, problem, samples, with_walls
+from systems import configured, model_of, periodic_frame, periodic_scene, problem, samples, with_walls
 
-from cconv.data.features import inputs_without_density
-from cconv.data.targets import make_sample
 from cconv.data.trajectory import Boundary
-from cconv.errors import ShapeError
+from cconv.errors import ConfigError, ShapeError
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.model import NetworkConfig, build_field_model
+from cconv.nn.kinds import Kinds
+from cconv.study.declared.configuration import configure
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
-SMALL = NetworkConfig(layers=2, first_channels=4, kernel_size=3)
+SMALL = configured(layers=2, first_channels=4, kernel_size=3)
 
 
 def test_defaults_have_the_published_sizes_and_filters():
-    network = NetworkConfig()
+    network = configured().network
     assert network.hidden_widths == [32, 64, 64]
     assert network.relative_cutoff * 0.05 == pytest.approx(0.225 / 2)
     assert (network.window, network.mapping, network.message) == ("poly6", "ball_to_cube_volume_preserving", "absolute")
@@ -35,16 +35,16 @@ def test_standardisation_comes_from_the_training_samples(generator):
 def test_a_frame_predicts_as_its_sample(generator):
     scene, frame = periodic_scene(), periodic_frame(generator)
     model = problem(generator).build_model(SMALL, 0)
-    sample = make_sample(frame, scene, "density_rate", kernel(scene))
+    sample = make_sample(frame, scene, task_named("density_rate"))
     torch.testing.assert_close(model.predict_frame(frame, scene), model.predict(sample.inputs))
 
 
 def test_walls_build_a_boundary_branch_and_are_demanded_later(generator):
     scene = periodic_scene()
     frame = with_walls(periodic_frame(generator))
-    walled = [make_sample(frame, scene, "density_rate", kernel(scene))]
-    model = build_field_model(SMALL, scene, "density_rate", "cubic_spline", scene.particle_spacing, walled)
-    assert model.config.boundary_channels == 2
+    walled = [make_sample(frame, scene, task_named("density_rate"))]
+    model = model_of(SMALL, scene, "density_rate", walled)
+    assert model.config.walls == Kinds(0, 1)
     assert model.predict(walled[0].inputs).shape == (64, 1)
     with pytest.raises(ShapeError, match="boundary"):
         model.predict(samples(generator, 1)[0].inputs)
@@ -61,9 +61,11 @@ def test_same_seed_same_weights_other_seed_others(generator):
 @pytest.mark.parametrize("message", ["absolute", "difference"])
 def test_a_radial_model_turns_with_the_scene(task, message, generator):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
-    train = [make_sample(frame, scene, task, kernel(scene))]
-    network = NetworkConfig(basis="radial", first_channels=6, hidden_channels=6, radial_terms=5, message=message)
-    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator)
+    train = [make_sample(frame, scene, task_named(task))]
+    network = configured(
+        architecture="radial_net", first_channels=6, hidden_channels=6, radial_terms=5, message=message
+    )
+    model = model_of(network, scene, task, train, generator)
     quarter = torch.tensor([[0.0, -1], [1, 0]])
     box_center = torch.tensor([0.5, 0.5])
 
@@ -84,20 +86,20 @@ def test_a_radial_model_turns_with_the_scene(task, message, generator):
     )
 
 
-def test_settings_of_the_other_basis_are_refused():
-    with pytest.raises(ValueError, match="skip 'after_activation' is for basis 'grid'"):
-        NetworkConfig(basis="radial", skip="after_activation")
+def test_settings_of_another_architecture_are_refused():
+    with pytest.raises(ConfigError, match="not possible .skip: Input should be 'before_activation' or 'none'"):
+        configured(architecture="radial_net", skip="after_activation")
 
 
-BASES = [SMALL, NetworkConfig(layers=2, basis="radial", first_channels=4, radial_terms=5)]
+BASES = [SMALL, configured(layers=2, architecture="radial_net", first_channels=4, radial_terms=5)]
 
 
 def walled_model(network, frame, generator, task="density_rate"):
     """A model of the periodic scene with walls, fitted to one frame."""
     scene = periodic_scene()
-    train = [make_sample(frame, scene, task, kernel(scene))]
-    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator)
-    if network.layers == 1:
+    train = [make_sample(frame, scene, task_named(task))]
+    model = model_of(network, scene, task, train, generator)
+    if network.network.layers == 1:
         solve_closed_form(model, train)
     return model
 
@@ -109,45 +111,45 @@ def with_moved_walls(frame):
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+@pytest.mark.parametrize("network", BASES, ids=lambda each: each.network.architecture)
 def test_only_a_model_with_a_boundary_branch_sees_the_walls(network, layers, generator):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
     moved = with_moved_walls(frame)
-    for boundary in (True, False):
-        settings = network.model_copy(update={"boundary": boundary, "layers": layers})
+    for walls in (True, False):
+        settings = configure({"walls": walls, "layers": layers}, network)
         model = walled_model(settings, frame, generator)
         sees = not torch.equal(model.predict_frame(frame, scene), model.predict_frame(moved, scene))
-        assert sees == boundary
+        assert sees == walls
 
 
 def test_a_model_without_boundary_branch_takes_scenes_with_and_without_walls(generator):
     scene, frame = periodic_scene(), periodic_frame(generator)
-    model = walled_model(SMALL.model_copy(update={"boundary": False}), with_walls(frame), generator)
-    assert model.config.boundary_channels == 0
+    model = walled_model(configure({"walls": False}, SMALL), with_walls(frame), generator)
+    assert model.config.walls is None
     walled, bare = (model.predict_frame(each, scene) for each in (with_walls(frame), frame))
     assert torch.equal(walled, bare)
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+@pytest.mark.parametrize("network", BASES, ids=lambda each: each.network.architecture)
 def test_only_a_model_with_the_density_feature_sees_the_masses(network, layers, generator):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
     heavier = replace(frame, masses=frame.masses * torch.tensor([0.875, 1.125]).repeat(32))  # of the same mean
     for density in (True, False):
-        settings = network.model_copy(update={"density": density, "layers": layers})
+        settings = configure({"density": density, "layers": layers}, network)
         model = walled_model(settings, frame, generator)
         sees = not torch.equal(model.predict_frame(frame, scene), model.predict_frame(heavier, scene))
         assert sees == density
 
 
-@pytest.mark.parametrize("network", BASES, ids=lambda network: network.basis)
+@pytest.mark.parametrize("network", BASES, ids=lambda each: each.network.architecture)
 def test_a_model_without_density_takes_inputs_with_and_without_it(network, generator):
     scene, frame = periodic_scene(), periodic_frame(generator)
-    sample = make_sample(frame, scene, "density_rate", kernel(scene))
-    bare = inputs_without_density(frame, scene)
-    model = walled_model(network.model_copy(update={"density": False}), frame, generator)
+    sample = make_sample(frame, scene, task_named("density_rate"))
+    bare = task_named("density_rate").inputs(frame, scene, ("one", "velocity"))
+    model = walled_model(configure({"density": False}, network), frame, generator)
     assert torch.equal(model.predict(sample.inputs), model.predict(bare))
-    with pytest.raises(ShapeError, match="expects 4 features .* have 3"):
+    with pytest.raises(ShapeError, match="takes the feature 'density', and the inputs hold one, velocity"):
         walled_model(network, frame, generator).predict(bare)
 
 
@@ -156,37 +158,28 @@ def test_what_is_switched_off_has_no_parameters(generator):
     frame = with_walls(periodic_frame(generator))
 
     def count(network, **switches):
-        return walled_model(network.model_copy(update=switches), frame, generator).num_parameters
+        return walled_model(configure(switches, network), frame, generator).num_parameters
 
-    grid, radial = BASES
-    cells, first = grid.kernel_size**2, grid.first_channels
+    (grid, radial), (of_grid, of_radial) = BASES, (each.network for each in BASES)
+    cells, first = of_grid.kernel_size**2, of_grid.first_channels
     branch = cells * 2 * first + first  # two components of the normal, and a bias
-    assert count(grid) - count(grid, boundary=False) == branch + (cells + 1) * first
+    assert count(grid) - count(grid, walls=False) == branch + (cells + 1) * first
     assert count(grid) - count(grid, density=False) == (cells + 1) * first
-    scalars, vectors = 2 * radial.first_channels, radial.first_channels  # a gate for each vector
-    of_a_normal = radial.radial_terms * (scalars + 2 * vectors)  # n·r̂; n and (n·r̂) r̂
-    assert count(radial) - count(radial, boundary=False) == of_a_normal
-    of_the_density = radial.radial_terms * (scalars + vectors) + scalars
+    scalars, vectors = 2 * of_radial.first_channels, of_radial.first_channels  # a gate for each vector
+    of_a_normal = of_radial.radial_terms * (scalars + 2 * vectors)  # n·r̂; n and (n·r̂) r̂
+    assert count(radial) - count(radial, walls=False) == of_a_normal
+    of_the_density = of_radial.radial_terms * (scalars + vectors) + scalars
     assert count(radial) - count(radial, density=False) == of_the_density
 
 
-@pytest.mark.parametrize("basis", ["grid", "radial"])
-@pytest.mark.parametrize("switches", [{"boundary": False}, {"density": False}, {"boundary": False, "density": False}])
-def test_a_switched_model_is_solved_saved_and_loaded(basis, switches, generator, tmp_path):
+@pytest.mark.parametrize("architecture", ["conv_net", "radial_net"])
+@pytest.mark.parametrize("switches", [{"walls": False}, {"density": False}, {"walls": False, "density": False}])
+def test_a_switched_model_is_solved_saved_and_loaded(architecture, switches, generator, tmp_path):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
-    network = NetworkConfig(layers=1, basis=basis, kernel_size=3, radial_terms=8, message="difference", **switches)
+    network = configured(
+        layers=1, architecture=architecture, kernel_size=3, radial_terms=8, message="difference", **switches
+    )
     model = walled_model(network, frame, generator)
     save_model(model, tmp_path / "model", {})
     again = load_model(tmp_path / "model")
     assert torch.equal(again.predict_frame(frame, scene), model.predict_frame(frame, scene))
-
-
-def test_a_model_stored_before_there_were_switches_has_both(generator, tmp_path):
-    frame = with_walls(periodic_frame(generator))
-    model = walled_model(SMALL, frame, generator)
-    save_model(model, tmp_path / "model", {})
-    path = tmp_path / "model" / "config.json"
-    stored = json.loads(path.read_text())
-    del stored["network"]["boundary"], stored["network"]["density"]
-    path.write_text(json.dumps(stored))
-    assert load_model(tmp_path / "model").config == model.config

@@ -29,32 +29,32 @@ def test_published_layer_sizes_and_parameter_count():
 
 def test_layers_follow_figure_3_1(scene, generator):
     """The forward pass spelled out: concatenate, then convolution + dense, skip before the activation."""
-    geometry, boundary_geometry, features, normals = scene
+    geometry, wall_geometry, features, normals = scene
     net = ConvNet(4, (5, 6, 6, 2), 3, 3, boundary_channels=3, generator=generator)
     z = torch.cat(
-        [net.boundary_conv(normals, boundary_geometry), net.convs[0](features, geometry), net.dense[0](features)], 1
+        [net.boundary_conv(normals, wall_geometry), net.convs[0](features, geometry), net.dense[0](features)], 1
     )
     z = net.convs[1](z.relu(), geometry) + net.dense[1](z.relu())
     z = net.convs[2](z.relu(), geometry) + net.dense[2](z.relu()) + z
     z = net.convs[3](z.relu(), geometry) + net.dense[3](z.relu())
-    assert torch.equal(net(features, geometry, normals, boundary_geometry), z)
+    assert torch.equal(net(features, geometry, normals, wall_geometry), z)
 
 
 def test_a_single_layer_adds_its_branches(scene, generator):
-    geometry, boundary_geometry, features, normals = scene
+    geometry, wall_geometry, features, normals = scene
     net = ConvNet(4, (2,), 3, 3, boundary_channels=3, generator=generator)
-    expected = net.boundary_conv(normals, boundary_geometry) + net.convs[0](features, geometry) + net.dense[0](features)
-    torch.testing.assert_close(net(features, geometry, normals, boundary_geometry), expected)
+    expected = net.boundary_conv(normals, wall_geometry) + net.convs[0](features, geometry) + net.dense[0](features)
+    torch.testing.assert_close(net(features, geometry, normals, wall_geometry), expected)
 
 
 def test_a_scene_without_boundary_builds_no_boundary_branch(scene):
-    geometry, boundary_geometry, features, normals = scene
+    geometry, wall_geometry, features, normals = scene
     net = ConvNet(4, (5, 6, 1), 3, 3)
     assert net.boundary_conv is None
     assert not any("boundary" in name for name, _ in net.named_parameters())
     assert net(features, geometry).shape == (25, 1)
     with pytest.raises(ShapeError, match="boundary"):
-        net(features, geometry, normals, boundary_geometry)
+        net(features, geometry, normals, wall_geometry)
 
 
 def test_boundary_branch_needs_boundary_inputs(scene):
@@ -67,10 +67,10 @@ def test_boundary_branch_needs_boundary_inputs(scene):
 @pytest.mark.parametrize("skip", SKIPS)
 @pytest.mark.parametrize("message", ["absolute", "difference"])
 def test_every_parameter_gets_a_gradient(activation, skip, message, scene):
-    geometry, boundary_geometry, features, normals = scene
+    geometry, wall_geometry, features, normals = scene
     options = {"activation": activation, "skip": skip, "message": message}
     net = ConvNet(4, (5, 6, 6, 2), 3, 3, boundary_channels=3, **options)
-    net(features, geometry, normals, boundary_geometry).square().sum().backward()
+    net(features, geometry, normals, wall_geometry).square().sum().backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in net.parameters())
 
 

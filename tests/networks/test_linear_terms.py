@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from cconv.errors import ConfigError
+from cconv.models.closed_form import NormalEquations
 from cconv.neighbors import radius_graph
 from cconv.networks import ConvNet, RadialNet
-from cconv.networks.linear_terms import NormalEquations, linear_layer
 from cconv.nn import ConvGeometry, RadialGeometry
 
 
@@ -40,7 +40,7 @@ def test_terms_times_coefficients_are_the_network(make, message, points, generat
     inputs = normal(generator, 80, 4), fluid, normal(generator, 30, 2), walls
     teacher, student = build(generator), build(generator)
     target = teacher(*inputs).detach()
-    layer = linear_layer(student)
+    layer = student.linear_terms()
     assert not torch.allclose(student(*inputs), target)
     solutions = []
     for terms, values in zip(layer.terms(*inputs), layer.targets(target), strict=True):
@@ -54,7 +54,7 @@ def test_terms_times_coefficients_are_the_network(make, message, points, generat
 @pytest.mark.parametrize("outputs", [(1, 0), (0, 1)])
 def test_scalars_or_vectors_alone(outputs, points, generator):
     build, (fluid, walls) = radial(points, "difference", outputs)
-    layer = linear_layer(build(generator))
+    layer = build(generator).linear_terms()
     terms = layer.terms(normal(generator, 80, 4), fluid, normal(generator, 30, 2), walls)
     targets = layer.targets(normal(generator, 80, 1 if outputs[0] else 2))
     assert len(terms) == len(targets) == 1
@@ -88,4 +88,4 @@ def test_dependent_terms_need_a_ridge(generator):
 
 def test_several_layers_have_no_closed_form():
     with pytest.raises(ConfigError, match="`network.layers` must be 1"):
-        linear_layer(ConvNet(2, (3, 1), 3, 2))
+        ConvNet(2, (3, 1), 3, 2).linear_terms()

@@ -7,7 +7,7 @@ from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
 from cconv.networks import RadialNet
 from cconv.nn import RadialConv, RadialGeometry
-from cconv.nn.radial_conv import join_kinds, num_values, split_kinds
+from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.sph import CubicSpline, density_gradient, density_rate
 
 CUTOFF = 0.4
@@ -65,7 +65,7 @@ def dense_radial_conv(layer, features, positions, senders_at, features_at_receiv
 def test_agrees_with_the_sum_over_all_pairs(dim, message, generator):
     positions = torch.rand(30, dim, generator=generator, dtype=torch.float64)
     layer = RadialConv((2, 3), (3, 2), 5, dim, message=message, generator=generator).double()
-    features = normal(generator, 30, num_values((2, 3), dim))
+    features = normal(generator, 30, Kinds(*(2, 3)).num_values(dim))
     output = layer(features, RadialGeometry(radius_graph(positions, CUTOFF), 5))
     torch.testing.assert_close(output, dense_radial_conv(layer, features, positions, positions, features))
 
@@ -86,7 +86,7 @@ def test_a_network_is_equivariant(dim, message, reflect, generator):
     network = RadialNet(
         (2, 1), ((6, 4), (6, 4), (3, 2)), 6, dim, boundary_channels=(0, 1), message=message, generator=generator
     ).double()
-    features, normals = normal(generator, 60, num_values((2, 1), dim)), normal(generator, 20, dim)
+    features, normals = normal(generator, 60, Kinds(*(2, 1)).num_values(dim)), normal(generator, 20, dim)
     matrix, shift = orthogonal(generator, dim, reflect), normal(generator, dim)
 
     def output(at, values, walls_at, wall_values):
@@ -195,7 +195,7 @@ def test_no_vectors_no_scalars_no_neighbours(generator):
         layer = RadialConv(channels_in, channels_out, 3, 2, generator=generator).double()
         with torch.no_grad():
             layer.bias.fill_(0.5)
-        output = layer(normal(generator, 2, num_values(channels_in, 2)), geometry)
+        output = layer(normal(generator, 2, Kinds(*channels_in).num_values(2)), geometry)
         scalars, vectors = split_kinds(output, channels_out, 2)
         assert (scalars == 0.5).all()
         assert (vectors == 0).all()

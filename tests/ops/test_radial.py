@@ -7,7 +7,7 @@ import torch
 
 from cconv.neighbors import radius_graph
 from cconv.nn import RadialConv, RadialGeometry
-from cconv.nn.radial_conv import num_values
+from cconv.nn.kinds import Kinds
 from cconv.ops import radial
 
 CHANNELS = [((2, 1), (1, 0)), ((2, 1), (0, 1)), ((0, 3), (3, 2)), ((3, 0), (2, 2)), ((1, 2), (20, 0))]
@@ -17,7 +17,7 @@ def case(generator, channels, dim=3, *, terms=6, message="absolute", window="non
     positions = torch.rand(points, dim, generator=generator, dtype=dtype)
     layer = RadialConv(*channels, terms, dim, bias=False, message=message, generator=generator).to(dtype)
     geometry = RadialGeometry(radius_graph(positions, 0.45), terms, window=window, normalize=window != "none")
-    features = torch.randn(points, num_values(channels[0], dim), generator=generator, dtype=dtype)
+    features = torch.randn(points, Kinds(*channels[0]).num_values(dim), generator=generator, dtype=dtype)
     return layer, features, geometry
 
 

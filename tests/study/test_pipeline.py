@@ -10,12 +10,12 @@ from conftest import SCRIPT
 from processes import PATIENCE
 
 from cconv import load_model, open_dataset
-from cconv.data.targets import iterate_samples
 from cconv.models.errors import frame_errors, normalized_mse
 from cconv.study.declared.domains import SearchSpace, fixed
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.optuna_mirror import open_storage
+from cconv.tasks.samples import iterate_samples
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_the_checkpoint_gives_the_reported_test_error_again(run, summary, flow_f
     dataset = open_dataset(flow_folder)
     for entry in summary["finalists"]:
         model = load_model(run.path / entry["checkpoint"], task=summary["task"])
-        errors = frame_errors(model, iterate_samples(dataset, "test", summary["task"], model.kernel))
+        errors = frame_errors(model, iterate_samples(dataset, "test", model.task))
         seed = (run.path / entry["checkpoint"]).parent.name
         assert normalized_mse(errors) == pytest.approx(entry["test"]["by_seed"][seed], rel=1e-6)
         assert model.num_parameters == entry["num_parameters"]
@@ -129,9 +129,9 @@ def test_what_was_chosen_was_chosen_by_validation_errors_and_each_split_has_its_
     errors = {entry["id"]: entry["valid"]["normalized_mse"] for entry in summary["finalists"]}
     assert {each["id"]: each["error"] for each in comparisons} == pytest.approx(errors)
     assert summary["recommended"]["id"] in {each["id"] for each in comparisons if each["eligible"]}
-    kernel = load_model(run.path / summary["finalists"][0]["checkpoint"]).kernel
+    task = load_model(run.path / summary["finalists"][0]["checkpoint"]).task
     train, valid, test = (
-        torch.cat([sample.target for sample in iterate_samples(dataset, split, summary["task"], kernel)]).double()
+        torch.cat([sample.target for sample in iterate_samples(dataset, split, task)]).double()
         for split in ("train", "valid", "test")
     )
     variance = train.var(dim=0, correction=0).mean()

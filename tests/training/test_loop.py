@@ -2,14 +2,13 @@ import math
 
 import pytest
 import torch
-from systems import problem
+from systems import configured, problem
 
 from cconv.errors import ConfigError
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.models.model import NetworkConfig
 from cconv.training.loop import SCHEDULES, train
 
-LINEAR = NetworkConfig(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")
+LINEAR = configured(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")
 
 
 def run(given, network=LINEAR, seed=0, **options):

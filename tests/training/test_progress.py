@@ -5,14 +5,13 @@ import itertools
 import pytest
 import torch
 from safetensors.torch import save_file
-from systems import problem
+from systems import configured, problem
 
 from cconv.errors import DataError
-from cconv.models.model import NetworkConfig
 from cconv.training.loop import train
 from cconv.training.progress import begin, load_progress, save_progress
 
-NETWORKS = [NetworkConfig(layers=2, kernel_size=3), NetworkConfig(layers=2, basis="radial", radial_terms=4)]
+NETWORKS = [configured(layers=2, kernel_size=3), configured(layers=2, architecture="radial_net", radial_terms=4)]
 OPTIONS = {"updates": 12, "evaluate_every": 3, "learning_rate": 0.01, "batch_size": 2}
 
 
@@ -26,7 +25,7 @@ def one_thread():
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: network.basis)
+@pytest.mark.parametrize("network", NETWORKS, ids=lambda each: each.network.architecture)
 @pytest.mark.parametrize("left_at", [1, 6, 11])
 def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, network, left_at):
     given = problem(generator)

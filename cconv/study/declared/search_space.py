@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from cconv.errors import ConfigError, did_you_mean, shown
-from cconv.evaluation.cost_model import Estimate
 from cconv.files import read_toml
-from cconv.models.model import NetworkConfig
+from cconv.networks.counting import CountedCost
+from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
 from cconv.study.declared.domains import SearchSpace, Value
-from cconv.study.declared.study_file import HYPERPARAMETERS, StudyConfig, TrainingConfig, configure
+from cconv.study.declared.study_file import StudyConfig
 from cconv.validation import validated
 
 
@@ -39,7 +39,7 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
     Raises:
         ConfigError: With the parameter and the value.
     """
-    settings = (study.network, study.training) if study else (NetworkConfig(), TrainingConfig())
+    defaults = study.configuration if study else DEFAULTS
     for name, parameter in space.parameters.items():
         if name not in HYPERPARAMETERS:
             raise ConfigError(
@@ -48,18 +48,18 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
             )
         for value in parameter.extremes:
             values = space.making_active(name) | {name: value}
-            _check_configures(values, settings, f"{source}: `parameters.{name}`: the value {shown(value)}")
-    _check_configures(space.baseline, settings, f"{source}: the baseline")
+            _check_configures(values, defaults, f"{source}: `parameters.{name}`: the value {shown(value)}")
+    _check_configures(space.baseline, defaults, f"{source}: the baseline")
 
 
-def _check_configures(parameters: Mapping[str, Value], settings: tuple, what: str) -> None:
+def _check_configures(parameters: Mapping[str, Value], defaults: Configuration, what: str) -> None:
     try:
-        configure(parameters, *settings)
+        configure(parameters, defaults)
     except ConfigError as error:
         raise ConfigError(f"{what} is {error}.") from error
 
 
-def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str, Value]], Estimate]) -> None:
+def check_baseline_affordable(space: SearchSpace, cost_of: Callable[[Mapping[str, Value]], CountedCost]) -> None:
     """Refuse a space whose own baseline costs more than its caps, once the scene is known.
 
     Args:

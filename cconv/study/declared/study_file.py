@@ -5,19 +5,24 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from cconv.errors import LONGEST_SHOWN, ConfigError, did_you_mean, shown, visible
+from cconv.errors import LONGEST_SHOWN, ConfigError, visible
 from cconv.files import DEEPEST, parse_toml, read_toml
-from cconv.models.model import NetworkConfig
-from cconv.sph.kernels import KERNELS
+from cconv.networks import ConvNetSettings, NetworkTable
+from cconv.study.declared.configuration import (
+    Configuration,
+    TaskConfig,
+    TrainingConfig,
+    Updates,
+    check_known,
+    configure,
+)
 from cconv.study.declared.stage_tables import Stage, check_names, check_order, default_stages, included
-from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole, validated
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Whole, validated
 
-MOST_UPDATES = 10**9
-Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
 _Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
 _Share = Annotated[Real, Field(ge=1e-6, le=1e6)]
@@ -33,35 +38,15 @@ def rungs_up_to(full_updates: int, grace_updates: int, reduction_factor: int) ->
 
 
 class DataConfig(StrictModel):
-    """Particle data and targets. Lengths and times in the units of the data; None takes what the data say."""
+    """Particle data. Lengths and times in the units of the data; None takes what the data say."""
 
     path: PathText | None = None
     particle_spacing: Length | None = None
     mass: Length | None = None
     frame_dt: Length | None = None
     force: tuple[_Component, ...] | None = Field(None, min_length=1, max_length=3)
-    kernel: str = "cubic_spline"
-    smoothing_length: Length | None = None
     split_fractions: tuple[_Share, _Share, _Share] = (0.7, 0.15, 0.15)
     gap: Whole = Field(2, ge=0, le=10**6)
-
-    @field_validator("kernel")
-    @classmethod
-    def _known_kernel(cls, name: str) -> str:
-        if name not in KERNELS:
-            raise ValueError(f"must be one of {', '.join(KERNELS)}")
-        return name
-
-
-class TrainingConfig(StrictModel):
-    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache."""
-
-    updates: Updates = 600
-    evaluate_every: Updates = 50
-    batch_size: Whole = Field(1, ge=1, le=10**6)
-    learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
-    schedule: Literal["constant", "cosine", "exponential"] = "cosine"
-    cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
 
 
 class SearchConfig(StrictModel):
@@ -127,9 +112,9 @@ class StudyConfig(StrictModel):
     """A whole study."""
 
     name: Name
-    task: Literal["density_rate", "density_gradient"]
+    task: TaskConfig
     data: DataConfig = DataConfig()
-    network: NetworkConfig = NetworkConfig()
+    network: NetworkTable = ConvNetSettings()
     training: TrainingConfig = TrainingConfig()
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
@@ -137,6 +122,16 @@ class StudyConfig(StrictModel):
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
     stages: dict[Name, Stage] = Field(default_factory=default_stages, min_length=1, max_length=100)
+
+    @field_validator("task", mode="before")
+    @classmethod
+    def _task_by_its_name(cls, task: object) -> object:
+        return task_table(task)
+
+    @field_validator("network", mode="before")
+    @classmethod
+    def _published_architecture(cls, network: object) -> object:
+        return {"architecture": "conv_net"} | network if isinstance(network, dict) else network
 
     @field_validator("stages", mode="before")
     @classmethod
@@ -172,10 +167,15 @@ class StudyConfig(StrictModel):
         for finalist, parameters in included(self.stages):
             try:
                 check_known(parameters)
-                configure(parameters, self.network, self.training)
+                configure(parameters, self.configuration)
             except ConfigError as error:
                 raise ValueError(f"finalist `{finalist}`: {error}") from error
         return self
+
+    @property
+    def configuration(self) -> Configuration:
+        """What trials have where no hyperparameter is drawn."""
+        return Configuration(self.task.taken, self.network, self.training)
 
     @property
     def rungs(self) -> list[int]:
@@ -188,39 +188,9 @@ class StudyConfig(StrictModel):
         return self.search.concurrency or os.cpu_count() or 1
 
 
-TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
-HYPERPARAMETERS = (*NetworkConfig.model_fields, *TRAINING_HYPERPARAMETERS)
-
-
-def check_known(parameters: Mapping[str, Value]) -> None:
-    """Raise `ConfigError` unless all names are those of hyperparameters."""
-    for name in parameters:
-        if name not in HYPERPARAMETERS:
-            raise ConfigError(
-                f"unknown hyperparameter {shown(name)}.{did_you_mean(name, HYPERPARAMETERS)} "
-                f"Known: {', '.join(HYPERPARAMETERS)}."
-            )
-
-
-def configure(
-    parameters: Mapping[str, Value], network: NetworkConfig, training: TrainingConfig
-) -> tuple[NetworkConfig, TrainingConfig]:
-    """Network and training settings with the drawn hyperparameters in place of the study's own.
-
-    Raises:
-        ConfigError: If they are not possible together.
-    """
-    drawn = {name: value for name, value in parameters.items() if name in TRAINING_HYPERPARAMETERS}
-    shape = {name: value for name, value in parameters.items() if name not in TRAINING_HYPERPARAMETERS}
-    try:
-        return (
-            NetworkConfig.model_validate(network.model_dump() | shape),
-            TrainingConfig.model_validate(training.model_dump() | drawn),
-        )
-    except ValidationError as error:
-        problem = error.errors()[0]
-        where = ".".join(map(str, problem["loc"])) or "together"
-        raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
+def task_table(task: object) -> object:
+    """The table of a task of which a study file gives the name alone."""
+    return {"name": task} if isinstance(task, str) else task
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
@@ -235,6 +205,8 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     """
     path = Path(path)
     values = read_toml(path)
+    if "task" in values:
+        values["task"] = task_table(values["task"])  # so that settings of it can be replaced
     for override in overrides:
         _apply(values, override)
     study = validated(StudyConfig, values, path)

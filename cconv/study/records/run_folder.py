@@ -13,7 +13,7 @@ from cconv.study.records.forms import FORMS, Result, Table, read_record
 from cconv.study.records.trials import KNOWN_BEFORE, TrialFolder, TrialRecord
 from cconv.validation import Id, check_setting
 
-FORMAT = 2  # of a run folder; another one is refused
+FORMAT = 3  # of a run folder; another one is refused
 
 _PART = re.compile(r"\..+-\d+")  # names of what is being written, which a kill leaves behind
 _FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json

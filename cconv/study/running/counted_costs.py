@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 
-from cconv.data.targets import VECTOR_TASKS
-from cconv.evaluation.cost import Cost, surroundings_of
-from cconv.evaluation.cost_model import Estimate, Surroundings, estimate
+from cconv.evaluation.cost import Cost, neighbor_density
 from cconv.evaluation.time_model import check_cost_model
-from cconv.study.declared.study_file import StudyConfig, configure
+from cconv.networks.counting import CountedCost, NeighborDensity
+from cconv.study.declared.configuration import configure
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.problem import Problem
+from cconv.tasks.features import WALLS, kinds_of
 
 FEWEST_MEASURED = 5  # models that a check of the cost model takes
 
@@ -26,26 +27,25 @@ class CostCounter:
     def __init__(self, study: StudyConfig, problem: Problem):
         self._study, self._problem = study, problem
         self._inputs = problem.valid_samples[0].inputs
-        self._surroundings = lru_cache(maxsize=4096)(self._count)
+        self._around = lru_cache(maxsize=4096)(self._count)
 
-    def __call__(self, parameters: Mapping) -> Estimate:
+    def __call__(self, parameters: Mapping) -> CountedCost:
         """Cost of one particle's prediction by a configuration.
 
         Raises:
             ConfigError: If its cutoff is more than the box allows.
         """
-        network, _ = configure(parameters, self._study.network, self._study.training)
-        boundary = self._inputs.boundary_features
-        return estimate(
-            network.model_dump(),
-            dim=self._problem.scene.dim,
-            vector_output=self._problem.task in VECTOR_TASKS,
-            boundary_channels=0 if boundary is None else boundary.shape[1],
-            surroundings=self._surroundings(network.relative_cutoff),
+        features, network, _ = configure(parameters, self._study.configuration)
+        return network.count(
+            kinds_of(features),
+            self._inputs.wall_kinds if WALLS in features else None,
+            self._problem.task.output,
+            self._problem.scene.dim,
+            self._around(network.relative_cutoff),
         )
 
-    def _count(self, relative_cutoff: float) -> Surroundings:
-        return surroundings_of(self._inputs, relative_cutoff)
+    def _count(self, relative_cutoff: float) -> NeighborDensity:
+        return neighbor_density(self._inputs, relative_cutoff)
 
 
 def points_of_search(count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]) -> dict:

@@ -8,12 +8,14 @@ import torch
 
 from cconv.data.dataset import Dataset, open_dataset
 from cconv.data.metadata import OVERRIDES
-from cconv.data.targets import Sample, iterate_samples
 from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
-from cconv.models.model import FieldModel, NetworkConfig, build_field_model
-from cconv.sph.kernels import kernel_named
+from cconv.models.model import Model, build_model
+from cconv.study.declared.configuration import Configuration, TaskConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
+from cconv.tasks import task_named
+from cconv.tasks.samples import Sample, iterate_samples
+from cconv.tasks.task import FieldTask
 from cconv.validation import PathText, check_setting, validated
 
 
@@ -23,28 +25,23 @@ class Problem:
 
     Attributes:
         scene: What all trajectories share.
-        task: "density_rate" or "density_gradient".
-        kernel: Field name of the SPH kernel.
-        smoothing_length: Its h, length.
+        task: What is asked.
         train_samples: Frames to learn from; features and targets are standardised by them.
         valid_samples: Frames that the search compares by.
     """
 
     scene: Scene
-    task: str
-    kernel: str
-    smoothing_length: float
+    task: FieldTask
     train_samples: list[Sample]
     valid_samples: list[Sample]
 
-    def build_model(self, network: NetworkConfig, init_seed: int) -> FieldModel:
+    def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """A fresh model with the initial weights of `init_seed`."""
-        return build_field_model(
-            network,
-            self.scene,
+        return build_model(
+            configuration.network,
             self.task,
-            self.kernel,
-            self.smoothing_length,
+            configuration.features,
+            self.scene,
             self.train_samples,
             torch.Generator().manual_seed(init_seed),
         )
@@ -82,14 +79,14 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
 
 
 def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[Sample]:
-    """Samples of a split with the study's task and kernel."""
-    kernel = kernel_named(study.data.kernel)(smoothing_length(study.data, dataset.scene), dataset.scene.dim)
-    return iterate_samples(dataset, split, study.task, kernel)
+    """Samples of a split for the study's task."""
+    return iterate_samples(dataset, split, study_task(study.task, dataset.scene))
 
 
-def smoothing_length(data: DataConfig, scene: Scene) -> float:
-    """The study's smoothing length; the particle spacing unless set."""
-    return data.smoothing_length or scene.particle_spacing
+def study_task(task: TaskConfig, scene: Scene) -> FieldTask:
+    """The task of a study in its scene."""
+    length = task.smoothing_length
+    return task_named(task.name, task.kernel, 1.0 if length is None else length / scene.particle_spacing)
 
 
 def load_problem(
@@ -104,9 +101,7 @@ def load_problem(
     """
     problem = Problem(
         scene=dataset.scene,
-        task=study.task,
-        kernel=study.data.kernel,
-        smoothing_length=smoothing_length(study.data, dataset.scene),
+        task=study_task(study.task, dataset.scene),
         train_samples=[],
         valid_samples=[],
     )
@@ -122,7 +117,7 @@ def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
         dataset: Its data, of which a fingerprint is kept; None where that follows later.
     """
     fingerprint = {} if dataset is None else {"data_sha256": dataset.fingerprint()}
-    return {"study": study.name, "task": study.task, "data": study.data.model_dump(mode="json"), **fingerprint}
+    return {"study": study.name, "task": study.task.name, "data": study.data.model_dump(mode="json"), **fingerprint}
 
 
 def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None = None) -> tuple[Dataset, bool]:

@@ -28,7 +28,8 @@ from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
 from cconv.errors import ConfigError, is_disk_full  # noqa: E402
-from cconv.study.declared.study_file import StudyConfig, TrainingConfig  # noqa: E402
+from cconv.study.declared.configuration import TrainingConfig
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.attempt import Attempt  # noqa: E402
 from cconv.study.running.private_ray import (  # noqa: E402
@@ -317,8 +318,7 @@ def _trial(
     yield from run_trial(
         problem,
         job.parameters,
-        study.network,
-        training,
+        study.configuration._replace(training=training),
         folder,
         stage=stage,
         init_seed=job.init_seed,

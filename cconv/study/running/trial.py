@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 
 from cconv.evaluation.cost import flops_per_particle
 from cconv.models.checkpoint import read_card, save_model
-from cconv.models.model import FieldModel, NetworkConfig
-from cconv.study.declared.study_file import TrainingConfig, configure
+from cconv.models.model import Model
+from cconv.study.declared.configuration import Configuration, TrainingConfig, configure
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem
 from cconv.training.loop import TrainingState, train
@@ -16,8 +16,7 @@ from cconv.training.progress import Progress, begin, load_progress, save_progres
 def run_trial(
     problem: Problem,
     parameters: Mapping,
-    network: NetworkConfig,
-    training: TrainingConfig,
+    defaults: Configuration,
     folder: TrialFolder,
     *,
     stage: str,
@@ -35,9 +34,8 @@ def run_trial(
 
     Args:
         problem: Scene, task and samples.
-        parameters: Hyperparameters that replace those of `network` and `training`.
-        network: The study's network settings.
-        training: The study's training settings.
+        parameters: Hyperparameters that replace those of `defaults`.
+        defaults: What the study says where nothing is drawn.
         folder: Where config.json, log.jsonl, progress.safetensors and checkpoint/ are written.
         stage: Stage that the trial belongs to.
         init_seed: Seed of the initial weights.
@@ -46,8 +44,9 @@ def run_trial(
         seconds_limit: Time that the training may take in all; it ends at the first update after that.
         on_update: Sees the state after every update.
     """
-    network, training = configure(parameters, network, training)
-    model = problem.build_model(network, init_seed)
+    configuration = configure(parameters, defaults)
+    training = configuration.training
+    model = problem.build_model(configuration, init_seed)
     config = describe(problem, parameters, model, training, stage=stage, init_seed=init_seed, data_seed=data_seed)
     progress = _begin_or_go_on(model, folder, config)
     card = config | dict(provenance)
@@ -88,7 +87,7 @@ def run_trial(
 def describe(
     problem: Problem,
     parameters: Mapping,
-    model: FieldModel,
+    model: Model,
     training: TrainingConfig,
     *,
     stage: str,
@@ -99,7 +98,8 @@ def describe(
     return {
         "stage": stage,
         "parameters": dict(parameters),
-        "network": model.config.network.model_dump(),
+        "features": list(model.config.features),
+        "network": model.settings.model_dump(),
         "training": training.model_dump(),
         "init_seed": init_seed,
         "data_seed": data_seed,
@@ -108,7 +108,7 @@ def describe(
     }
 
 
-def _begin_or_go_on(model: FieldModel, folder: TrialFolder, config: Mapping) -> Progress:
+def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progress:
     if not folder.progress.is_file():
         folder.start(config)
         return begin(model)

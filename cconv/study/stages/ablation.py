@@ -8,14 +8,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from cconv.study.declared.configuration import configure
 from cconv.study.declared.stage_tables import BASELINE, reads_of
-from cconv.study.declared.study_file import configure
 from cconv.study.evidence.ablation_path import ablation_order, path_configurations
 from cconv.study.evidence.surrogate import FEWEST_TRIALS
-from cconv.study.stages.closed_form import BRANCHES, fit_whole
+from cconv.study.stages.closed_form import fit_whole
 from cconv.study.stages.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
 from cconv.study.stages.search import train_all
 from cconv.study.stages.session import Session
+from cconv.tasks.features import WALLS
 
 
 def ablate(session: Session, stage: str) -> dict:
@@ -83,9 +84,10 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
 def _turned_over(session: Session, best: Retrained) -> dict[str, dict]:
     """The best finalist with each branch or feature that the scene offers turned over."""
     parameters = best.records[0].parameters
-    network, _ = configure(parameters, session.study.network, session.study.training)
-    offered = [name for name in BRANCHES if name != "boundary" or session.problem.scene.has_boundary]
-    return {name: parameters | {name: not getattr(network, name)} for name in offered}
+    features = configure(parameters, session.study.configuration).features
+    optional = session.problem.task.optional
+    offered = [name for name in optional if name != WALLS or session.problem.scene.has_boundary]
+    return {name: parameters | {name: name not in features} for name in offered}
 
 
 def _entry(session: Session, finalist: str, change: str, parameters: Mapping) -> dict:

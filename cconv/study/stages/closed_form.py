@@ -11,36 +11,38 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import accumulate
+from itertools import accumulate, chain
 
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
-from cconv.data.targets import Sample
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import save_model
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.models.model import NetworkConfig
+from cconv.networks.network import NetworkSettings
+from cconv.study.declared.configuration import OPTIONAL_FEATURES, configure
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
 from cconv.study.declared.stage_tables import reads_of
-from cconv.study.declared.study_file import configure
 from cconv.study.evidence.recommendation import choose_finalists
 from cconv.study.records.trials import TrialFolder, TrialRecord
 from cconv.study.running.problem import provenance
 from cconv.study.running.trial import describe
 from cconv.study.stages.search import trial_name
 from cconv.study.stages.session import Session
+from cconv.tasks.samples import Sample
 from cconv.validation import Value
 
 STAGE = "closed_form"
 MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
-BRANCHES = ("boundary", "density")  # what a model may do without
-_OF_ANY = ("basis", "relative_cutoff", "window", "normalize", "message", "boundary", "density")
-_OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"), "radial": ("radial_terms",)}
+_OF_ANY = ("architecture", "relative_cutoff", "window", "normalize", "message", *OPTIONAL_FEATURES)
+_OF_ARCHITECTURE = {
+    "conv_net": ("kernel_size", "mapping", "interpolation", "align_corners"),
+    "radial_net": ("radial_terms",),
+}
 
 
-def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: int) -> list[dict[str, Value]]:
+def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range: int) -> list[dict[str, Value]]:
     """Distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
 
     Conditions hold as in the search. A space of deeper networks only has single layers too, as a floor to compare with.
@@ -54,14 +56,18 @@ def single_layers(space: SearchSpace, network: NetworkConfig, values_per_range: 
     drawn: list[dict] = [{}]
     for name in space.parents_first:
         values = [1] if name == "layers" else _values(space.parameters[name], values_per_range)
-        if name in ("layers", *_OF_ANY, *_OF_BASIS["grid"], *_OF_BASIS["radial"]):
+        if name in ("layers", *_OF_ANY, *chain.from_iterable(_OF_ARCHITECTURE.values())):
             choices = [{name: value} for value in values]
             drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
     layers: dict[str, dict] = {}
     for values in drawn:
-        basis = values.get("basis", network.basis)
-        applies = (*_OF_ANY, *_OF_BASIS[basis])
-        layer = {"layers": 1, "basis": basis, **{name: value for name, value in values.items() if name in applies}}
+        architecture = values.get("architecture", network.architecture)
+        applies = (*_OF_ANY, *_OF_ARCHITECTURE[architecture])
+        layer = {
+            "layers": 1,
+            "architecture": architecture,
+            **{name: value for name, value in values.items() if name in applies},
+        }
         layers.setdefault(layer_id(layer), layer)
     return list(layers.values())
 
@@ -79,8 +85,8 @@ def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list
 def screen_closed_forms(session: Session, stage: str) -> dict:
     """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
 
-    Half of them are drawn from all layers that the space holds, as many of each basis; the others are proposed from
-    the records of those before.
+    Half of them are drawn from all layers that the space holds, as many of each architecture; the others are proposed
+    from the records of those before.
     """
     settings, problem = session.study.stages[stage], session.problem
     layers = single_layers(session.space, session.study.network, settings.values_per_range)
@@ -126,7 +132,7 @@ def layer_id(layer: Mapping[str, Value]) -> str:
 
 
 def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
-    """The layers that differ in one setting; what comes and goes with a basis counts with it."""
+    """The layers that differ in one setting; what comes and goes with an architecture counts with it."""
     return [other for other in others if sum(layer[name] != other[name] for name in layer if name in other) == 1]
 
 
@@ -161,9 +167,9 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
 
 
 def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> tuple[str, dict[str, Value]]:
-    """Id and hyperparameters of a candidate without the `BRANCHES` whose loss its validation error does not show.
+    """Drop each optional feature whose loss the validation error does not show; id and hyperparameters that remain.
 
-    A branch goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
+    A feature goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
     """
 
     def fitted(finalist: str, parameters: Mapping[str, Value]) -> float:
@@ -173,7 +179,7 @@ def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> 
 
     finalist, parameters = candidate.id, candidate.parameters
     error = fitted(finalist, parameters)
-    for branch in BRANCHES:
+    for branch in OPTIONAL_FEATURES:
         if parameters.get(branch) and False in session.space.parameters[branch].values:
             leaner, fewer = f"{finalist}_no_{branch}", parameters | {branch: False}
             error_without = fitted(leaner, fewer)
@@ -204,9 +210,9 @@ def _fit_and_record(
     if folder.ended:
         return
     study, problem = session.study, session.problem
-    network, training = configure(parameters, study.network, study.training)
-    model = problem.build_model(network, 0)
-    untrained = training.model_copy(update={"updates": 0})
+    configuration = configure(parameters, study.configuration)
+    model = problem.build_model(configuration, 0)
+    untrained = configuration.training.model_copy(update={"updates": 0})
     seeds = {"init_seed": init_seed, "data_seed": study.seeds.data}
     config = describe(problem, parameters, model, untrained, stage=stage, **seeds) | {
         "closed_form": True,
@@ -239,13 +245,13 @@ def _fit_and_record(
 
 
 def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[str, Value]]:
-    """At most `count` layers, as many of each basis as there are, drawn at random where there are more."""
+    """At most `count` layers, as many of each architecture as there are, drawn at random where there are more."""
     drawn = [layers[index] for index in np.random.default_rng(seed).permutation(len(layers))]
     rank = Counter()
     ranked = []
     for layer in drawn:
-        rank[layer["basis"]] += 1
-        ranked.append((rank[layer["basis"]], layer))
+        rank[layer["architecture"]] += 1
+        ranked.append((rank[layer["architecture"]], layer))
     chosen = [layer for _, layer in sorted(ranked, key=lambda item: item[0])[:count]]
     return [layer for layer in layers if layer in chosen]
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cconv.data.targets import Sample
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
 from cconv.evaluation.statistics import crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.errors import frame_errors, normalized_mse
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.stage_tables import BASELINE
-from cconv.study.declared.study_file import StudyConfig, TrainingConfig
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.evidence.budget import fall_at_the_end
 from cconv.study.evidence.recommendation import choose_finalists
 from cconv.study.records.run_folder import RunFolder
@@ -24,6 +24,7 @@ from cconv.study.running.trial_queue import Job, job_in
 from cconv.study.stages.closed_form import fit_closed_form_finalists
 from cconv.study.stages.search import train_all
 from cconv.study.stages.session import Session
+from cconv.tasks.samples import Sample
 
 FINALISTS = "finalists"
 

@@ -7,7 +7,7 @@ goes on as it would have, and one that finished takes more trials.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from cconv.study.declared.study_file import TrainingConfig
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.evidence.strategies import best_so_far, spent_updates
 from cconv.study.records.rungs import RungFile
 from cconv.study.records.trials import TrialFolder, TrialRecord

@@ -10,14 +10,12 @@ from itertools import islice
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
-from cconv.data.targets import Sample
 from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.models.checkpoint import load_model
 from cconv.models.errors import mean_predictor_error, normalized_mse
-from cconv.sph.kernels import AbstractKernel, kernel_named
 from cconv.study.declared.stage_tables import BASELINE, reads_of
 from cconv.study.evidence.budget import budget_words
 from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
@@ -26,7 +24,7 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.rungs import RungFile
 from cconv.study.records.trials import count_outcomes
 from cconv.study.running.counted_costs import points_of_search
-from cconv.study.running.problem import Problem, study_samples
+from cconv.study.running.problem import study_samples
 from cconv.study.stages.finalists import (
     Retrained,
     check_any_finished,
@@ -36,6 +34,7 @@ from cconv.study.stages.finalists import (
     retrained_finalists,
 )
 from cconv.study.stages.session import Session
+from cconv.tasks.samples import Sample
 
 TIMED_FRAMES = 5
 GROWTH_REPEATS = 3
@@ -63,7 +62,7 @@ def select(session: Session, stage: str) -> dict:
     entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
     summary = {
         "study": study.name,
-        "task": study.task,
+        "task": study.task.name,
         "dataset": _dataset(session, samples),
         "baseline": BASELINE,
         "mean_predictor": trivial,
@@ -175,7 +174,6 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
         frames,
         session.dataset.scene,
         task=problem.task,
-        kernel=_kernel(problem),
         threads=settings.threads,
         repeats=settings.repeats,
     )
@@ -207,7 +205,7 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    probes = make_probes(trajectories, scene, problem.task, _kernel(problem), reach)
+    probes = make_probes(trajectories, scene, problem.task, reach)
     return {
         finalist.id: measure_stability(
             {
@@ -218,10 +216,6 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]
         )
         for finalist in session.progress(finalists, "stability")
     }
-
-
-def _kernel(problem: Problem) -> AbstractKernel:
-    return kernel_named(problem.kernel)(problem.smoothing_length, problem.scene.dim)
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:

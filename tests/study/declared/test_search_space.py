@@ -4,11 +4,12 @@ from pathlib import Path
 import pytest
 
 from cconv.errors import ConfigError
-from cconv.evaluation.cost_model import Estimate
-from cconv.models.model import NetworkConfig
+from cconv.networks import RadialNetSettings
+from cconv.networks.counting import CountedCost
+from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
 from cconv.study.declared.search_space import check_baseline_affordable, load_space
-from cconv.study.declared.study_file import TrainingConfig, configure, load_study
+from cconv.study.declared.study_file import load_study
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
 
 REPOSITORY = Path(__file__).parents[3]
@@ -22,11 +23,16 @@ FLOAT = (
 INT = '[parameters.kernel_size]\ntype = "int"\nrange = [3, 6]\nbaseline = 4\nreason = "r"\n'
 
 
-BASIS = '[parameters.basis]\ntype = "choice"\nvalues = ["grid", "radial"]\nbaseline = "grid"\nreason = "r"\n'
+ARCHITECTURE = """[parameters.architecture]
+type = "choice"
+values = ["conv_net", "radial_net"]
+baseline = "conv_net"
+reason = "r"
+"""
 SKIP = (
     '[parameters.skip]\ntype = "choice"\nvalues = ["after_activation"]\nbaseline = "after_activation"\nreason = "r"\n'
 )
-OF_GRID = 'when = { basis = ["grid"] }\n'
+OF_GRID = 'when = { architecture = ["conv_net"] }\n'
 
 
 @pytest.fixture
@@ -43,25 +49,23 @@ def space_file(tmp_path):
 def test_every_space_of_the_repository_loads_and_explains_itself(path):
     space = load_space(path)
     assert all(len(parameter.reason) > 5 for parameter in space.parameters.values())
-    configure(space.baseline, NetworkConfig(), TrainingConfig())
+    configure(space.baseline, DEFAULTS)
 
 
 @pytest.mark.parametrize("name", ["density", "thesis_initial", "thesis_random", "thesis_bayesian"])
 def test_the_baseline_is_the_published_network_and_training(name):
     space = load_space(next(path for path in SPACES if path.stem == name))
-    network, training = configure(space.baseline, NetworkConfig(), TrainingConfig())
-    assert network == NetworkConfig()
-    assert training == TrainingConfig()
+    assert configure(space.baseline, DEFAULTS) == DEFAULTS
 
 
 def conditional_space():
-    """Kernel size on the grid only; mapping only for the larger two; terms on the radial basis only."""
+    """Kernel size on the grid only; mapping only for the larger two; terms on the radial architecture only."""
     parameters = {
         "mapping": {"values": ["identity", "ball_to_cube_radial"], "when": {"kernel_size": [4, 5]}},
-        "kernel_size": {"type": "int", "range": [3, 5], "baseline": 4, "when": {"basis": ["grid"]}},
-        "basis": {"values": ["grid", "radial"]},
-        "radial_terms": {"values": [8, 16], "when": {"basis": ["radial"]}},
-        "window": {"values": ["none", "poly6"], "when": {"basis": ["grid"], "layers": [2]}},
+        "kernel_size": {"type": "int", "range": [3, 5], "baseline": 4, "when": {"architecture": ["conv_net"]}},
+        "architecture": {"values": ["conv_net", "radial_net"]},
+        "radial_terms": {"values": [8, 16], "when": {"architecture": ["radial_net"]}},
+        "window": {"values": ["none", "poly6"], "when": {"architecture": ["conv_net"], "layers": [2]}},
         "layers": {"values": [1, 2]},
     }
     for parameter in parameters.values():
@@ -71,16 +75,23 @@ def conditional_space():
     return SearchSpace.model_validate({"name": "c", "description": "d", "parameters": parameters})
 
 
-ALL = {"mapping": "identity", "kernel_size": 4, "basis": "grid", "radial_terms": 8, "window": "none", "layers": 2}
+ALL = {
+    "mapping": "identity",
+    "kernel_size": 4,
+    "architecture": "conv_net",
+    "radial_terms": 8,
+    "window": "none",
+    "layers": 2,
+}
 
 
 @pytest.mark.parametrize(
     ("changes", "active"),
     [
-        ({}, {"mapping", "kernel_size", "basis", "window", "layers"}),
-        ({"kernel_size": 3}, {"kernel_size", "basis", "window", "layers"}),
-        ({"layers": 1}, {"mapping", "kernel_size", "basis", "layers"}),
-        ({"basis": "radial"}, {"basis", "radial_terms", "layers"}),
+        ({}, {"mapping", "kernel_size", "architecture", "window", "layers"}),
+        ({"kernel_size": 3}, {"kernel_size", "architecture", "window", "layers"}),
+        ({"layers": 1}, {"mapping", "kernel_size", "architecture", "layers"}),
+        ({"architecture": "radial_net"}, {"architecture", "radial_terms", "layers"}),
     ],
 )
 def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
@@ -92,18 +103,23 @@ def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
 def test_parents_come_before_those_that_depend_on_them():
     order = conditional_space().parents_first
     assert sorted(order) == sorted(ALL)
-    assert order.index("basis") < order.index("kernel_size") < order.index("mapping")
+    assert order.index("architecture") < order.index("kernel_size") < order.index("mapping")
 
 
 def test_the_baseline_holds_active_parameters_only():
-    assert conditional_space().baseline == {"mapping": "identity", "kernel_size": 4, "basis": "grid", "layers": 1}
+    assert conditional_space().baseline == {
+        "mapping": "identity",
+        "kernel_size": 4,
+        "architecture": "conv_net",
+        "layers": 1,
+    }
 
 
 def test_a_configuration_is_whole_and_in_its_domain():
     space = conditional_space()
     whole = space.active(ALL)
     assert space.holds(whole)
-    assert space.holds({"basis": "radial", "radial_terms": 8, "layers": 1})
+    assert space.holds({"architecture": "radial_net", "radial_terms": 8, "layers": 1})
     missing = {name: value for name, value in whole.items() if name != "mapping"}
     for wrong in (ALL, missing, whole | {"kernel_size": 7}, whole | {"learning_rate": 1e-3}):
         assert not space.holds(wrong)
@@ -113,8 +129,8 @@ def test_conditions_follow_a_narrower_domain():
     space = conditional_space()
     small = narrowed(space, {"kernel_size": space.parameters["kernel_size"].model_copy(update={"range": (3, 4)})})
     assert small.parameters["mapping"].when == {"kernel_size": [4]}
-    grid = Choice(type="choice", values=["grid"], baseline="grid", reason="r")
-    assert narrowed(space, {"basis": grid}).parameters.keys() == ALL.keys() - {"radial_terms"}
+    grid = Choice(type="choice", values=["conv_net"], baseline="conv_net", reason="r")
+    assert narrowed(space, {"architecture": grid}).parameters.keys() == ALL.keys() - {"radial_terms"}
 
 
 def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
@@ -126,20 +142,22 @@ def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
 
 
 def test_single_layers_hold_what_is_active_in_one():
-    layers = single_layers(conditional_space(), NetworkConfig(), 3)
-    grid = [layer for layer in layers if layer["basis"] == "grid"]
-    assert [layer for layer in grid if layer["kernel_size"] == 3] == [{"layers": 1, "basis": "grid", "kernel_size": 3}]
+    layers = single_layers(conditional_space(), DEFAULTS.network, 3)
+    grid = [layer for layer in layers if layer["architecture"] == "conv_net"]
+    assert [layer for layer in grid if layer["kernel_size"] == 3] == [
+        {"layers": 1, "architecture": "conv_net", "kernel_size": 3}
+    ]
     assert all(
-        set(layer) == {"layers", "basis", "kernel_size", "mapping"} for layer in grid if layer["kernel_size"] > 3
+        set(layer) == {"layers", "architecture", "kernel_size", "mapping"} for layer in grid if layer["kernel_size"] > 3
     )
     assert len(grid) == 1 + 2 * 2  # no window: it takes two layers
-    radial = [layer for layer in layers if layer["basis"] == "radial"]
-    assert radial == [{"layers": 1, "basis": "radial", "radial_terms": terms} for terms in (8, 16)]
+    radial = [layer for layer in layers if layer["architecture"] == "radial_net"]
+    assert radial == [{"layers": 1, "architecture": "radial_net", "radial_terms": terms} for terms in (8, 16)]
 
 
 def test_single_layers_of_the_density_space_are_distinct_configurations_with_all_switches():
     space = load_space(next(path for path in SPACES if path.stem == "density"))
-    layers = single_layers(space, NetworkConfig(), 2)
+    layers = single_layers(space, DEFAULTS.network, 2)
     assert len({repr(sorted(layer.items())) for layer in layers}) == len(layers)
     assert all(space.holds(layer | {"learning_rate": 1e-3}) for layer in layers)
     assert {(layer["boundary"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
@@ -157,7 +175,7 @@ def test_a_baseline_above_the_cap_is_refused():
 
 
 def costing(flops):
-    return Estimate(flops_per_particle=flops, bytes_per_particle=2e3)
+    return CountedCost(flops_per_particle=flops, bytes_per_particle=2e3)
 
 
 @pytest.mark.parametrize(
@@ -174,20 +192,23 @@ def costing(flops):
         (INT.replace('"int"', '"integer"'), "parameters.kernel_size"),
         ("", "`parameters` is missing"),
         ("max_flops_per_particle = 0.0\n" + CHOICE, "`max_flops_per_particle`: input should be greater than 0"),
-        (INT + OF_GRID, r"`parameters\.kernel_size\.when\.basis`: names no parameter of the space"),
-        (INT + 'when = { bases = ["grid"] }\n' + BASIS, r"Did you mean 'basis'"),
+        (INT + OF_GRID, r"`parameters\.kernel_size\.when\.architecture`: names no parameter of the space"),
+        (INT + 'when = { architectures = ["conv_net"] }\n' + ARCHITECTURE, r"Did you mean 'architecture'"),
         (
-            INT + 'when = { basis = ["gird"] }\n' + BASIS,
-            r"basis`: lists 'gird', which is not in the domain of 'basis'",
+            INT + 'when = { architecture = ["gird"] }\n' + ARCHITECTURE,
+            r"architecture`: lists 'gird', which is not in the domain of 'architecture'",
         ),
         (
-            INT + "when = { basis = [] }\n" + BASIS,
-            r"`parameters\.kernel_size\.when\.basis`: list should have",
+            INT + "when = { architecture = [] }\n" + ARCHITECTURE,
+            r"`parameters\.kernel_size\.when\.architecture`: list should have",
         ),
         (CHOICE + "when = { kernel_size = [7] }\n" + INT, r"when\.kernel_size`: lists 7, which is not in the domain"),
         (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
         (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
-        (BASIS.replace('= "grid"', '= "radial"') + SKIP, r"the baseline is not possible .*skip 'after_activation'"),
+        (
+            ARCHITECTURE.replace('= "conv_net"', '= "radial_net"') + SKIP,
+            r"the baseline is not possible .skip: Input should be 'before_activation'",
+        ),
         (FLOAT.replace("1e-2]", "inf]"), r"`parameters\.learning_rate\.range\.1`: input should be a finite number"),
         (FLOAT.replace("1e-4", "1e-300"), r"the value 1e-300 is not possible"),
         (
@@ -217,10 +238,12 @@ def test_true_is_no_one(space_file):
 
 
 def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
-    path = space_file(BASIS)
+    path = space_file(ARCHITECTURE)
     study = load_study(REPOSITORY / "experiments" / "smoke.toml", ["network.skip=after_activation"])
     load_space(path)
-    with pytest.raises(ConfigError, match="`parameters.basis`: the value 'radial' is not possible .*after_activation"):
+    with pytest.raises(
+        ConfigError, match="`parameters.architecture`: the value 'radial_net' is not possible .skip: Input"
+    ):
         load_space(path, study)
 
 
@@ -234,7 +257,7 @@ def test_layers_of_a_huge_space_are_drawn_without_listing_them():
         for name, values in choices.items()
     }
     space = SearchSpace.model_validate({"name": "huge", "description": "d", "parameters": parameters})
-    network = NetworkConfig(basis="radial")
+    network = RadialNetSettings()
     layers = single_layers(space, network, 3)
     assert 1000 < len(layers) <= MOST_LAYERS
     assert {layer["relative_cutoff"] for layer in layers} == set(choices["relative_cutoff"])

@@ -37,7 +37,7 @@ def test_every_study_of_the_repository_loads_and_finds_its_space(path):
 def test_minimal_study_has_the_published_network_and_defaults(study_file):
     study = load_study(study_file(MINIMAL))
     assert study.network.layers == 4
-    assert study.data.kernel == "cubic_spline"
+    assert study.task.kernel == "cubic_spline"
     assert study.finalists.seeds >= 2
 
 
@@ -57,7 +57,6 @@ def test_settings_replace_those_of_the_file(study_file):
         ('[stages.random]\n[stages.refine]\nreads = ["rando"]', "`refine` names `rando`.* Did you mean 'random'"),
         ("[training]\nupdates = 10", "grace_updates .50. must not exceed"),
         ("grace_updates = 60", "multiple of"),
-        ('[data]\nkernel = "cubic"', r"`data\.kernel`: must be one of cubic_spline"),
         ("[finalists]\nseeds = 1", r"`finalists\.seeds`: .*greater than or equal to 2"),
         ("[trainin]\nupdates = 10", "unknown key `trainin`. Did you mean 'training'"),
         ("give_up_above = inf", r"`search\.give_up_above`: input should be a finite number, got inf"),
@@ -68,7 +67,6 @@ def test_settings_replace_those_of_the_file(study_file):
         ("[training]\nlearning_rate = nan", r"`training\.learning_rate`: input should be a finite number"),
         ("[data]\nmass = inf", r"`data\.mass`: input should be a finite number"),
         ("[data]\nparticle_spacing = 1e-300", r"`data\.particle_spacing`: input should be greater than"),
-        ("[data]\nsmoothing_length = 1e300", r"`data\.smoothing_length`: input should be less than"),
         ('[data]\npath = "a\\u0000b"', r"`data\.path`: a path must hold"),
         ("[seeds]\ninit = 9223372036854775808", r"`seeds\.init`: input should be less than 2147483648"),
         ("[cost]\nsizes = []", r"`cost\.sizes`: tuple should have at least 1 item"),
@@ -158,7 +156,10 @@ def test_names_that_could_be_taken_for_others_are_refused(stages, message, study
         ("{ layer = 2 }", "finalist `x`: unknown hyperparameter 'layer'. Did you mean 'layers'"),
         ("{ layers = 99 }", r"finalist `x`: not possible .layers: Input should be less than or equal to 16"),
         ("{ layers = true }", r"finalist `x`: not possible .layers: Input should be a valid integer"),
-        ('{ basis = "radial", skip = "after_activation" }', "finalist `x`: not possible .*skip 'after_activation'"),
+        (
+            '{ architecture = "radial_net", skip = "after_activation" }',
+            "finalist `x`: not possible .skip: Input should be",
+        ),
         ("{ learning_rate = inf }", r"include\.x\.learning_rate`: must be true, false, a number"),
         ("{ layers = [1] }", r"include\.x\.layers`: must be true, false, a number"),
     ],
@@ -191,3 +192,29 @@ def test_what_is_no_regular_file_is_refused_without_reading_it(tmp_path):
     for path in ("/dev/zero", tmp_path, tmp_path / "fifo"):
         with pytest.raises(ConfigError, match="no regular file"):
             load_study(path)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("task.kernel=cubic", r"`task\.kernel`: must be one of cubic_spline"),
+        ("task.smoothing_length=1e300", r"`task\.smoothing_length`: input should be less than"),
+        ("task.name=density_rat", r"`task\.name`: input should be 'density_rate' or 'density_gradient'"),
+        ('task.features=["velocity", "densit"]', "no feature 'densit'; Did you mean 'density'"),
+        ('task.features=["walls"]', "the feature `velocity` must be one of `features`"),
+        ("network.architecture=grid", "does not match any of the expected tags: 'conv_net', 'radial_net'"),
+        ("network.radial_terms=8", r"unknown key `network\.radial_terms`"),
+    ],
+)
+def test_a_task_or_network_that_is_none_is_named(study_file, override, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load_study(study_file(""), [override])
+    assert "\n" not in str(error.value)
+
+
+def test_a_task_is_given_by_name_or_as_a_table(study_file):
+    path = study_file("")
+    assert load_study(path).task.taken == ("one", "density", "velocity", "walls")
+    study = load_study(path, ['task.features=["velocity"]', "network.architecture=radial_net"])
+    assert study.task.taken == ("one", "velocity")
+    assert study.network.radial_terms == 16

@@ -15,15 +15,15 @@ SPACE = SearchSpace(
     name="test",
     description="a test",
     parameters={
-        "basis": Choice(values=["grid", "radial"], baseline="grid", **WORDS),
-        "kernel_size": Choice(values=[3, 4, 5], baseline=4, when={"basis": ["grid"]}, **WORDS),
-        "terms": Choice(values=[4, 8], baseline=4, when={"basis": ["radial"]}, **WORDS),
+        "architecture": Choice(values=["conv_net", "radial_net"], baseline="conv_net", **WORDS),
+        "kernel_size": Choice(values=[3, 4, 5], baseline=4, when={"architecture": ["conv_net"]}, **WORDS),
+        "terms": Choice(values=[4, 8], baseline=4, when={"architecture": ["radial_net"]}, **WORDS),
         "width": Choice(values=[8, 16], baseline=16, **WORDS),
         "rate": FloatRange(type="float", range=(1e-4, 1e-1), scale="log", baseline=1e-3, reason="a test"),
     },
 )
-BASELINE = {"basis": "grid", "kernel_size": 4, "width": 16, "rate": 1e-3}
-BEST = {"basis": "radial", "terms": 8, "width": 8, "rate": 1e-2}
+BASELINE = {"architecture": "conv_net", "kernel_size": 4, "width": 16, "rate": 1e-3}
+BEST = {"architecture": "radial_net", "terms": 8, "width": 8, "rate": 1e-2}
 
 
 def record(number, parameters, error):
@@ -35,12 +35,12 @@ def record(number, parameters, error):
 
 def error_of(each):
     from_best_rate = abs(math.log10(each["rate"]) + 2)
-    return 10 ** (-2 - (each["basis"] == "radial") + 0.3 * from_best_rate - 0.05 * (each["width"] == 8))
+    return 10 ** (-2 - (each["architecture"] == "radial_net") + 0.3 * from_best_rate - 0.05 * (each["width"] == 8))
 
 
 @pytest.fixture(scope="module")
 def records():
-    """Trials whose error falls most with the basis, less with the rate, hardly with the width."""
+    """Trials whose error falls most with the architecture, less with the rate, hardly with the width."""
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(80):
@@ -54,11 +54,17 @@ def records():
 
 
 def test_what_helps_most_comes_first(records):
-    assert ablation_order(records, SPACE, BASELINE, BEST, 9, useless_error=1.0) == ["basis", "rate", "width"]
-    assert ablation_order(records, SPACE, BASELINE, BEST, 9, seed=5, useless_error=1.0) == ["basis", "rate", "width"]
+    assert ablation_order(records, SPACE, BASELINE, BEST, 9, useless_error=1.0) == ["architecture", "rate", "width"]
+    assert ablation_order(records, SPACE, BASELINE, BEST, 9, seed=5, useless_error=1.0) == [
+        "architecture",
+        "rate",
+        "width",
+    ]
 
 
-@pytest.mark.parametrize("order", [["basis", "rate", "width"], ["width", "basis", "rate"], ["rate", "width", "basis"]])
+@pytest.mark.parametrize(
+    "order", [["architecture", "rate", "width"], ["width", "architecture", "rate"], ["rate", "width", "architecture"]]
+)
 def test_a_path_leads_from_the_baseline_to_the_best_by_valid_configurations(order):
     path = path_configurations(BASELINE, BEST, order, SPACE)
     assert path[0] == BASELINE
@@ -66,7 +72,7 @@ def test_a_path_leads_from_the_baseline_to_the_best_by_valid_configurations(orde
     assert all(SPACE.active(each) == each for each in path)
     for change, before, after in zip(order, path, path[1:], strict=False):
         assert {name for name in before if name in after and before[name] != after[name]} == {change}
-    turned = order.index("basis") + 1
+    turned = order.index("architecture") + 1
     assert all("kernel_size" in each and "terms" not in each for each in path[:turned])
     assert all("kernel_size" not in each and "terms" in each for each in path[turned:])
 

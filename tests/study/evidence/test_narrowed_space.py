@@ -23,9 +23,11 @@ SPACE = SearchSpace.model_validate(
             "message": {
                 "type": "choice", "values": ["absolute", "difference"], "baseline": "difference", "reason": "r."
             },
-            "basis": {"type": "choice", "values": ["grid", "radial"], "baseline": "grid", "reason": "r."},
+            "architecture": {
+                "type": "choice", "values": ["conv_net", "radial_net"], "baseline": "conv_net", "reason": "r."
+            },
             "kernel_size": {
-                "type": "int", "range": [2, 12], "baseline": 7, "reason": "r.", "when": {"basis": ["grid"]}
+                "type": "int", "range": [2, 12], "baseline": 7, "reason": "r.", "when": {"architecture": ["conv_net"]}
             },
             "mapping": {
                 "type": "choice", "values": ["identity", "ball_to_cube_radial"], "baseline": "identity", "reason": "r.",
@@ -37,7 +39,7 @@ SPACE = SearchSpace.model_validate(
 
 
 def error_of(parameters, message=10.0):
-    """Best at a learning rate of 3e-3, kernel size 7 and differences; the cutoff and the basis do not matter.
+    """Best at a learning rate of 3e-3, kernel size 7 and differences; the cutoff and the architecture do not matter.
 
     `message` says how strongly the message acts on the logarithm.
     """
@@ -87,7 +89,7 @@ def test_ranges_close_in_on_the_known_optimum_and_what_has_no_influence_stays(re
     assert 1e-4 < low < 3e-3 < high < 1e-1
     low, high = refined.parameters["kernel_size"].range
     assert 2 < low <= 7 <= high < 12
-    assert unchanged(refined) == {"relative_cutoff", "message", "basis", "mapping"}
+    assert unchanged(refined) == {"relative_cutoff", "message", "architecture", "mapping"}
     assert all("narrowed to" in reasons[name] for name in ("learning_rate", "kernel_size"))
     assert all("kept: no clear preference" in reasons[name] for name in unchanged(refined))
 
@@ -97,7 +99,7 @@ def test_a_value_that_the_best_do_not_use_goes(records_of):
     refined, reasons = refine(SPACE, records_of(240), FULL)
     assert refined.parameters["message"].values == ["difference"]
     assert "hardly use 'absolute' (0 of the best, 1" in reasons["message"]
-    assert {"relative_cutoff", "basis"} <= unchanged(refined)
+    assert {"relative_cutoff", "architecture"} <= unchanged(refined)
 
 
 def test_trials_are_compared_at_the_largest_budget_that_enough_reached():
@@ -109,7 +111,7 @@ def test_conditions_follow_what_is_left():
     refined, reasons = refine(SPACE, records_of(240), FULL)
     assert "mapping" not in refined.parameters
     assert reasons["mapping"] == "left out: nothing that is left of message makes it active"
-    assert refined.parameters["kernel_size"].when == {"basis": ["grid"]}
+    assert refined.parameters["kernel_size"].when == {"architecture": ["conv_net"]}
 
 
 def test_the_refined_space_holds_the_best_trial_and_the_baseline():

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from systems import problem
+from systems import configured, problem
 
 from cconv.evaluation.cost import Cost, flops_per_particle
-from cconv.models.model import NetworkConfig
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.counted_costs import CostCounter, points_of_search
@@ -32,10 +31,10 @@ def cost(us_per_particle):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("parameters", [*PARAMETERS, {"basis": "radial", "layers": 2}, {"density": False}])
+@pytest.mark.parametrize("parameters", [*PARAMETERS, {"architecture": "radial_net", "layers": 2}, {"density": False}])
 def test_the_count_is_that_of_the_built_model(generator, parameters):
     given = problem(generator)
-    model = given.build_model(NetworkConfig(**parameters), 0)
+    model = given.build_model(configured(**parameters), 0)
     counted = CostCounter(STUDY, given)(parameters).flops_per_particle
     assert counted == pytest.approx(flops_per_particle(model, given.valid_samples[0].inputs))
 

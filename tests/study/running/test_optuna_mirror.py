@@ -14,13 +14,18 @@ SPACE = SearchSpace.model_validate(
         "name": "s",
         "description": "d",
         "parameters": {
-            "basis": {"type": "choice", "values": ["grid", "radial"], "baseline": "grid", "reason": "r"},
+            "architecture": {
+                "type": "choice",
+                "values": ["conv_net", "radial_net"],
+                "baseline": "conv_net",
+                "reason": "r",
+            },
             "kernel_size": {
                 "type": "int",
                 "range": [3, 5],
                 "baseline": 4,
                 "reason": "r",
-                "when": {"basis": ["grid"]},
+                "when": {"architecture": ["conv_net"]},
             },
         },
     }
@@ -41,7 +46,7 @@ def entry(updates, error):
 
 
 def tell(observer, name, errors, outcome, parameters=None):
-    observer.on_trial_start(name, parameters or {"basis": "grid", "kernel_size": 4})
+    observer.on_trial_start(name, parameters or {"architecture": "conv_net", "kernel_size": 4})
     for updates, error in errors:
         observer.on_trial_result(name, entry(updates, error))
     if outcome:
@@ -50,12 +55,12 @@ def tell(observer, name, errors, outcome, parameters=None):
 
 def test_only_the_full_budget_is_complete_and_stopped_trials_are_pruned_with_their_last_value(tmp_path):
     observer = mirror(tmp_path)
-    tell(observer, "full", [(3, 0.9), (9, 0.5)], "completed", {"basis": "radial"})
+    tell(observer, "full", [(3, 0.9), (9, 0.5)], "completed", {"architecture": "radial_net"})
     tell(observer, "stopped", [(3, 0.7)], "stopped")
     tell(observer, "diverged", [(3, None)], "diverged")
     tell(observer, "failed", [], "failed")
     full, stopped, diverged, failed = trials(tmp_path)
-    assert (full.state, full.value, full.params) == (TrialState.COMPLETE, 0.5, {"basis": "radial"})
+    assert (full.state, full.value, full.params) == (TrialState.COMPLETE, 0.5, {"architecture": "radial_net"})
     assert (stopped.state, stopped.value, stopped.intermediate_values) == (TrialState.PRUNED, 0.7, {3: 0.7})
     assert (diverged.state, diverged.intermediate_values) == (TrialState.PRUNED, {3: DIVERGED_ERROR})
     assert failed.state == TrialState.FAIL
@@ -99,7 +104,7 @@ def test_any_database_that_optuna_knows_will_do(tmp_path):
 
 def record(name, errors, outcome):
     log = [entry(updates, error) for updates, error in errors]
-    parameters = {"basis": "grid", "kernel_size": 4}
+    parameters = {"architecture": "conv_net", "kernel_size": 4}
     return TrialRecord(id=name, stage="random", parameters=parameters, config={}, log=log, outcome=outcome, reason="")
 
 

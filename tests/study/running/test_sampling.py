@@ -27,8 +27,12 @@ SPACE = SearchSpace.model_validate(
                 "type": "int", "range": [4, 64], "scale": "log", "baseline": 32, "reason": "r",
                 "when": {"layers": [2, 3]},
             },
-            "basis": {"type": "choice", "values": ["grid", "radial"], "baseline": "grid", "reason": "r"},
-            "kernel_size": {"type": "int", "range": [3, 7], "baseline": 4, "reason": "r", "when": {"basis": ["grid"]}},
+            "architecture": {
+                "type": "choice", "values": ["conv_net", "radial_net"], "baseline": "conv_net", "reason": "r",
+            },
+            "kernel_size": {
+                "type": "int", "range": [3, 7], "baseline": 4, "reason": "r", "when": {"architecture": ["conv_net"]},
+            },
         },
     }
 )  # fmt: skip

@@ -1,21 +1,20 @@
 import json
 
 import pytest
-from systems import problem
+from systems import configured, problem
 
 from cconv.models.checkpoint import load_model, read_card
-from cconv.models.model import NetworkConfig
-from cconv.study.declared.study_file import TrainingConfig
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.trial import run_trial
 
-NETWORK = NetworkConfig(layers=1, kernel_size=3, message="difference")
+NETWORK = configured(layers=1, kernel_size=3, message="difference")
 TRAINING = TrainingConfig(updates=6, evaluate_every=2)
 
 
 def trial(given, folder, parameters=None, **options):
     return run_trial(
-        given, parameters or {}, NETWORK, TRAINING, folder,
+        given, parameters or {}, NETWORK._replace(training=TRAINING), folder,
         stage="random", init_seed=1, data_seed=0, provenance={"task": given.task}, **options,
     )  # fmt: skip
 

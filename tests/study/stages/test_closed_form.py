@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import pytest
 
 from cconv import load_model, open_dataset
-from cconv.data.targets import iterate_samples
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.models.model import NetworkConfig
+from cconv.study.declared.configuration import DEFAULTS
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.stages import closed_form
 from cconv.study.stages.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, layer_id, propose, single_layers
+from cconv.tasks.samples import iterate_samples
 
 
 def space_of(**parameters):
@@ -26,42 +26,47 @@ def space_of(**parameters):
 
 def test_every_combination_is_tried_once_and_what_has_no_effect_is_left_out():
     space = space_of(
-        basis=["grid", "radial"], kernel_size=[2, 3, 4], radial_terms=[8, 16], window=["none", "poly6"], layers=[1, 4],
-        learning_rate=[1e-3, 1e-2],
+        architecture=["conv_net", "radial_net"], kernel_size=[2, 3, 4], radial_terms=[8, 16],
+        window=["none", "poly6"], layers=[1, 4], learning_rate=[1e-3, 1e-2],
     )  # fmt: skip
-    layers = single_layers(space, NetworkConfig(), 3)
-    grid = [layer for layer in layers if layer["basis"] == "grid"]
-    radial = [layer for layer in layers if layer["basis"] == "radial"]
+    layers = single_layers(space, DEFAULTS.network, 3)
+    grid = [layer for layer in layers if layer["architecture"] == "conv_net"]
+    radial = [layer for layer in layers if layer["architecture"] == "radial_net"]
     assert len(grid) == 3 * 2
     assert len(radial) == 2 * 2
-    assert all(set(layer) == {"layers", "basis", "kernel_size", "window"} for layer in grid)
-    assert all(set(layer) == {"layers", "basis", "radial_terms", "window"} for layer in radial)
+    assert all(set(layer) == {"layers", "architecture", "kernel_size", "window"} for layer in grid)
+    assert all(set(layer) == {"layers", "architecture", "radial_terms", "window"} for layer in radial)
     assert all(layer["layers"] == 1 for layer in layers)
 
 
 def test_ranges_are_sampled_with_both_ends():
     space = load_space("search_spaces/density.toml")
-    layers = single_layers(space, NetworkConfig(), 3)
+    layers = single_layers(space, DEFAULTS.network, 3)
     assert {layer["relative_cutoff"] for layer in layers} == {1.5, 2.0, 2.5}
 
 
 def test_a_draw_holds_as_many_of_each_basis():
-    layers = [{"basis": "grid", "kernel_size": size} for size in range(50)]
-    layers += [{"basis": "radial", "radial_terms": terms} for terms in range(5)]
+    layers = [{"architecture": "conv_net", "kernel_size": size} for size in range(50)]
+    layers += [{"architecture": "radial_net", "radial_terms": terms} for terms in range(5)]
     drawn = _draw(layers, 20, seed=0)
     assert len(drawn) == 20
-    assert sum(layer["basis"] == "radial" for layer in drawn) == 5
+    assert sum(layer["architecture"] == "radial_net" for layer in drawn) == 5
     assert drawn == _draw(layers, 20, seed=0) != _draw(layers, 20, seed=1)
     assert _draw(layers, 100, seed=0) == layers
 
 
 LAYERS = single_layers(
-    space_of(basis=["grid", "radial"], kernel_size=[2, 3, 4], radial_terms=[8, 16, 32], window=["none", "poly6"]),
-    NetworkConfig(),
+    space_of(
+        architecture=["conv_net", "radial_net"],
+        kernel_size=[2, 3, 4],
+        radial_terms=[8, 16, 32],
+        window=["none", "poly6"],
+    ),
+    DEFAULTS.network,
     3,
 )
-RADIAL = [layer for layer in LAYERS if layer["basis"] == "radial"]
-GRID = [layer for layer in LAYERS if layer["basis"] == "grid"]
+RADIAL = [layer for layer in LAYERS if layer["architecture"] == "radial_net"]
+GRID = [layer for layer in LAYERS if layer["architecture"] == "conv_net"]
 
 
 def changes(layer, other):
@@ -119,7 +124,7 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
     (record,) = run.retrainings()[entry["id"]]
     assert record.is_closed_form
     model = load_model(run.path / entry["checkpoint"])
-    samples = list(iterate_samples(open_dataset(flow_folder), "test", "density_gradient", model.kernel))
+    samples = list(iterate_samples(open_dataset(flow_folder), "test", model.task))
     assert entry["test"]["normalized_mse"] == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
     assert list(entry["test"]["by_seed"]) == [record.id]
     assert "1 unit says too little of others" in entry["test"]["why_no_interval"]
@@ -147,7 +152,7 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
     space = space_of(boundary=[True, False], density=[True, False])
     study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
-    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True, "density": True})
+    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True, "density": True})
     finalist, parameters = _lean(session, candidate, seed=1, ridge=0.0)
     assert " ".join(branch for branch in BRANCHES if parameters[branch]) == kept
     assert finalist == "found" + "".join(f"_no_{branch}" for branch in BRANCHES if not parameters[branch])
@@ -163,7 +168,7 @@ def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkey
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(boundary=[True]))
-    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True})
+    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True})
     assert _lean(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
     assert fitted == [candidate.parameters]
 

@@ -3,10 +3,9 @@
 from types import SimpleNamespace
 
 import torch
-from systems import periodic_scene, periodic_trajectory, problem
+from systems import configured, periodic_scene, periodic_trajectory, problem
 
 from cconv.models.checkpoint import save_model
-from cconv.models.model import NetworkConfig
 from cconv.study.stages.finalists import Retrained
 from cconv.study.stages.select import _stress
 
@@ -15,7 +14,7 @@ def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
     """One of two seeds predicts no numbers, and not the best one; the failures name it."""
     given = problem(generator)
     for seed in (1, 2):
-        model = given.build_model(NetworkConfig(layers=1, kernel_size=3), seed)
+        model = given.build_model(configured(layers=1, kernel_size=3), seed)
         if seed == 2:
             torch.nn.init.constant_(next(model.parameters()), 3e38)  # no file may hold nan
         save_model(model, tmp_path / str(seed), {})

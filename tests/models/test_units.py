@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from systems import kernel, periodic_frame, periodic_scene, with_walls
+from systems import configured, model_of, periodic_frame, periodic_scene, with_walls
 
-from cconv.data.targets import make_sample
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.model import NetworkConfig, build_field_model
-from cconv.sph import CubicSpline
+from cconv.models.model import build_model
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
 TASKS = ("density_rate", "density_gradient")
 NETWORKS = [
-    NetworkConfig(layers=2, first_channels=4, kernel_size=3, message=message, basis=basis, radial_terms=5)
-    for basis in ("grid", "radial")
+    configured(layers=2, first_channels=4, kernel_size=3, message=message, architecture=architecture, radial_terms=5)
+    for architecture in ("conv_net", "radial_net")
     for message in ("absolute", "difference")
 ]
 
@@ -43,11 +43,13 @@ def in_other_units(frame: Frame, scene: Scene, length: float, mass: float, time:
     ("length", "mass", "time"), [(1e3, 1.0, 1.0), (1.0, 1e-3, 1.0), (1.0, 1.0, 60.0), (0.3, 7.0, 1e-4)]
 )
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: f"{network.basis}-{network.message}")
+@pytest.mark.parametrize(
+    "network", NETWORKS, ids=lambda network: f"{network.network.architecture}-{network.network.message}"
+)
 def test_predictions_change_by_the_factors_of_the_units(network, task, length, mass, time, generator):
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
-    train = [make_sample(frame, scene, task, kernel(scene))]
-    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator)
+    train = [make_sample(frame, scene, task_named(task))]
+    model = model_of(network, scene, task, train, generator)
     expected = model.predict_frame(frame, scene)
     density = mass / length**scene.dim
     expected = expected * (density / time if task == "density_rate" else density / length)
@@ -67,7 +69,7 @@ def flow(spacing: float, generator: torch.Generator) -> tuple[Frame, Scene]:
 
 def own_error(model, frame, scene, task):
     """Mean squared error by the variance of the frame's own target."""
-    target = make_sample(frame, scene, task, CubicSpline(scene.particle_spacing, 2))
+    target = make_sample(frame, scene, task_named(task))
     field = target.target.double() * target.target_unit
     difference = model.predict_frame(frame, scene) - field
     return float(difference.square().mean() / field.var(dim=0, correction=0).mean())
@@ -75,13 +77,13 @@ def own_error(model, frame, scene, task):
 
 @pytest.mark.parametrize("density", [True, False])
 def test_a_fit_at_one_resolution_holds_at_others(density, generator):
-    network = NetworkConfig(
-        layers=1, basis="radial", radial_terms=16, message="difference", relative_cutoff=2.0, density=density
+    network = configured(
+        layers=1, architecture="radial_net", radial_terms=16, message="difference", relative_cutoff=2.0, density=density
     )
     frames = [flow(0.02, generator) for _ in range(3)]
     scene = frames[0][1]
-    train = [make_sample(frame, scene, "density_rate", CubicSpline(0.02, 2)) for frame, _ in frames]
-    model = build_field_model(network, scene, "density_rate", "cubic_spline", 0.02, train)
+    train = [make_sample(frame, scene, task_named("density_rate")) for frame, _ in frames]
+    model = model_of(network, scene, "density_rate", train)
     solve_closed_form(model, train)
     errors = {spacing: own_error(model, *flow(spacing, generator), "density_rate") for spacing in (0.02, 0.025, 0.05)}
     assert max(errors.values()) < 1e-3, errors
@@ -89,8 +91,8 @@ def test_a_fit_at_one_resolution_holds_at_others(density, generator):
 
 def test_the_kernel_goes_with_the_spacing(generator):
     scene, frame = periodic_scene(), periodic_frame(generator)
-    train = [make_sample(frame, scene, "density_rate", CubicSpline(1.5 / 8, 2))]
-    model = build_field_model(NetworkConfig(layers=1), scene, "density_rate", "cubic_spline", 1.5 / 8, train)
+    task = task_named("density_rate", relative_smoothing_length=1.5)
+    model = build_model(configured(layers=1).network, task, task.features, scene, [make_sample(frame, scene, task)])
     assert model.config.relative_smoothing_length == 1.5
     assert model.kernel_at(0.02).smoothing_length == pytest.approx(0.03)
     assert model.kernel.smoothing_length == pytest.approx(1.5 / 8)
@@ -98,7 +100,7 @@ def test_the_kernel_goes_with_the_spacing(generator):
 
 def test_a_periodic_box_too_narrow_for_the_cutoff_is_refused(generator):
     scene, frame = periodic_scene(4), periodic_frame(generator, 4)
-    train = [make_sample(periodic_frame(generator), periodic_scene(), "density_rate", kernel(periodic_scene()))]
-    model = build_field_model(NetworkConfig(layers=1), periodic_scene(), "density_rate", "cubic_spline", 1 / 8, train)
+    train = [make_sample(periodic_frame(generator), periodic_scene(), task_named("density_rate"))]
+    model = model_of(configured(layers=1), periodic_scene(), "density_rate", train)
     with pytest.raises(ConfigError, match="at most half of every periodic axis, got 2.25 on axis 0 of length 4"):
         model.predict_frame(frame, scene)

@@ -5,23 +5,25 @@ from dataclasses import replace
 
 import pytest
 import torch
-from systems import kernel, periodic_frame, periodic_scene, with_walls
+from systems import configured, model_of, periodic_frame, periodic_scene, with_walls
 
-from cconv.data.targets import make_sample
 from cconv.data.trajectory import Boundary
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.model import NetworkConfig, build_field_model
+from cconv.networks import ConvNetSettings
+from cconv.nn.kinds import Kinds
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_sample
 
 KINDS = [
-    {"basis": basis, "message": message, "layers": layers, "boundary": boundary, "density": density}
-    for basis, message, layers, boundary, density in itertools.product(
-        ("grid", "radial"), ("absolute", "difference"), (1, 3), (True, False), (True, False)
+    {"architecture": architecture, "message": message, "layers": layers, "walls": walls, "density": density}
+    for architecture, message, layers, walls, density in itertools.product(
+        ("conv_net", "radial_net"), ("absolute", "difference"), (1, 3), (True, False), (True, False)
     )
 ]
 
 
 def network_of(kind):
-    return NetworkConfig(
+    return configured(
         first_channels=3,
         hidden_channels=3,
         kernel_size=3,
@@ -37,8 +39,8 @@ def built(network, task, generator):
     normals = torch.nn.functional.normalize(torch.randn(32, 2, generator=generator))
     walls = Boundary(positions=points[64:], normals=normals)
     frame = replace(periodic_frame(generator), positions=points[:64], boundary=walls)
-    train = [make_sample(frame, scene, task, kernel(scene))]
-    return build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, train, generator), train[0]
+    train = [make_sample(frame, scene, task_named(task))]
+    return model_of(network, scene, task, train, generator), train[0]
 
 
 @pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
@@ -58,35 +60,39 @@ def test_every_parameter_gets_a_gradient(kind, task, generator):
         assert (parameter.grad != 0).all() if parameter.numel() else True, name
 
 
-@pytest.mark.parametrize("basis", ["grid", "radial"])
+@pytest.mark.parametrize("architecture", ["conv_net", "radial_net"])
 @pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
 @pytest.mark.parametrize("density", [True, False])
-def test_no_two_coefficients_of_a_layer_of_differences_do_the_same(basis, task, density, generator):
+def test_no_two_coefficients_of_a_layer_of_differences_do_the_same(architecture, task, density, generator):
     """The layer as a linear map of its coefficients has full rank."""
-    from cconv.networks.linear_terms import linear_layer
-
-    kind = {"basis": basis, "message": "difference", "layers": 1, "boundary": True, "density": density}
+    kind = {"architecture": architecture, "message": "difference", "layers": 1, "walls": True, "density": density}
     rows = []
     for _ in range(3):
         model, sample = built(network_of(kind), task, generator)
         inputs = sample.inputs.double()
-        rows.append(linear_layer(model.network).terms(*model.network_inputs(inputs, model.geometry(inputs))))
+        rows.append(model.network.linear_terms().terms(*model.network_inputs(inputs, model.geometry(inputs))))
     for terms in (torch.cat(same) for same in zip(*rows, strict=True)):
         values = torch.linalg.svdvals(terms / terms.norm(dim=0))
         assert values.min() > 1e-6 * values.max()
 
 
 def test_eight_radial_terms_on_velocities_have_eight_parameters(generator):
-    network = NetworkConfig(
-        layers=1, basis="radial", radial_terms=8, message="difference", boundary=False, density=False
+    network = configured(
+        layers=1, architecture="radial_net", radial_terms=8, message="difference", walls=False, density=False
     )
     assert built(network, "density_rate", generator)[0].num_parameters == 8
 
 
 @pytest.mark.parametrize("layers", [1, 2, 4])
-@pytest.mark.parametrize("basis", ["grid", "radial"])
-def test_a_rigid_translation_gives_no_rate_at_all(basis, layers, generator):
-    settings = {"basis": basis, "message": "difference", "layers": layers, "boundary": False, "density": False}
+@pytest.mark.parametrize("architecture", ["conv_net", "radial_net"])
+def test_a_rigid_translation_gives_no_rate_at_all(architecture, layers, generator):
+    settings = {
+        "architecture": architecture,
+        "message": "difference",
+        "layers": layers,
+        "walls": False,
+        "density": False,
+    }
     model, sample = built(network_of(settings), "density_rate", generator)
     if layers == 1:
         solve_closed_form(model, [sample])
@@ -98,9 +104,9 @@ def test_a_rigid_translation_gives_no_rate_at_all(basis, layers, generator):
         assert (model.predict_frame(frame, scene) == 0).all()
 
 
-@pytest.mark.parametrize("kind", [{"boundary": True, "density": True}, {"boundary": False, "density": True}])
+@pytest.mark.parametrize("kind", [{"walls": True, "density": True}, {"walls": False, "density": True}])
 def test_differences_predict_the_same_rate_in_every_frame_of_reference(kind, generator):
-    network = network_of({"basis": "radial", "message": "difference", "layers": 2, **kind})
+    network = network_of({"architecture": "radial_net", "message": "difference", "layers": 2, **kind})
     model, _ = built(network, "density_rate", generator)
     frame, scene = with_walls(periodic_frame(generator)), periodic_scene()
     expected = model.predict_frame(frame, scene)
@@ -109,16 +115,5 @@ def test_differences_predict_the_same_rate_in_every_frame_of_reference(kind, gen
 
 
 def test_the_published_network_keeps_its_parameters():
-    from cconv.models.model import FieldConfig, _grid_network
-
-    config = FieldConfig(
-        task="density_gradient",
-        dim=3,
-        particle_spacing=0.05,
-        kernel="cubic_spline",
-        relative_smoothing_length=1.0,
-        boundary_channels=3,
-        network=NetworkConfig(density=False),
-    )
-    network = _grid_network(config, None)
+    network = ConvNetSettings().build(Kinds(1, 1), Kinds(0, 1), Kinds(0, 1), 3)
     assert sum(parameter.numel() for parameter in network.parameters()) == 692_902

@@ -3,32 +3,35 @@ from dataclasses import replace as with_changes
 
 import pytest
 import torch
-from systems import kernel, periodic_frame, periodic_scene, with_walls
+from systems import configured, model_of, periodic_frame, periodic_scene, with_walls
 
-from cconv.data.targets import make_sample
-from cconv.evaluation.cost import flops_per_particle, surroundings_of
-from cconv.evaluation.cost_model import Surroundings, ball_volume, estimate
-from cconv.models.model import NetworkConfig, build_field_model
+from cconv.evaluation.cost import flops_per_particle, neighbor_density
+from cconv.networks import ARCHITECTURES
+from cconv.networks.counting import NeighborDensity, ball_volume
 from cconv.nn import ContinuousConv
+from cconv.nn.kinds import Kinds
+from cconv.tasks import task_named
+from cconv.tasks.features import kinds_of
+from cconv.tasks.samples import make_sample
 
 SEVERAL = {"layers": 3, "first_channels": 5, "hidden_channels": 7}
 GRID = [
-    NetworkConfig(**SEVERAL),
-    NetworkConfig(**SEVERAL, interpolation="nearest_neighbor", density=False),
-    NetworkConfig(layers=1, kernel_size=3, boundary=False, relative_cutoff=1.7),
+    configured(**SEVERAL),
+    configured(**SEVERAL, interpolation="nearest_neighbor", density=False),
+    configured(layers=1, kernel_size=3, walls=False, relative_cutoff=1.7),
 ]
 RADIAL = [
-    NetworkConfig(basis="radial", layers=1, message="difference", radial_terms=8, density=False),
-    NetworkConfig(basis="radial", **SEVERAL, boundary=False),
-    NetworkConfig(basis="radial", layers=3, first_channels=3, hidden_channels=24, radial_terms=5),
+    configured(architecture="radial_net", layers=1, message="difference", radial_terms=8, density=False),
+    configured(architecture="radial_net", **SEVERAL, walls=False),
+    configured(architecture="radial_net", layers=3, first_channels=3, hidden_channels=24, radial_terms=5),
 ]
 
 
 def built(network, task, normals, generator):
     frame = with_walls(periodic_frame(generator), normals)
     scene = periodic_scene()
-    sample = make_sample(frame, scene, task, kernel(scene))
-    model = build_field_model(network, scene, task, "cubic_spline", scene.particle_spacing, [sample])
+    sample = make_sample(frame, scene, task_named(task))
+    model = model_of(network, scene, task, [sample])
     return model, sample.inputs
 
 
@@ -37,7 +40,7 @@ def counted_on(model, inputs):
     geometry, network = model.geometry(inputs), model.network
     convs = [(conv, geometry.fluid) for conv in network.convs]
     if network.boundary_conv is not None:
-        convs.append((network.boundary_conv, geometry.boundary))
+        convs.append((network.boundary_conv, geometry.walls))
     total = sum(of_conv(*conv) for conv in convs) / inputs.num_particles
     for dense in network.dense:
         for name, weights in dense.named_parameters():
@@ -67,22 +70,29 @@ def of_reads(filters, reads):
 
 @pytest.mark.parametrize("normals", [True, False])
 @pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
-@pytest.mark.parametrize("network", GRID + RADIAL, ids=lambda network: f"{network.basis}-{network.layers}")
+@pytest.mark.parametrize(
+    "network", GRID + RADIAL, ids=lambda each: f"{each.network.architecture}-{each.network.layers}"
+)
 def test_equals_the_count_on_a_built_model(network, task, normals, generator):
     model, inputs = built(network, task, normals, generator)
     assert flops_per_particle(model, inputs) == pytest.approx(counted_on(model, inputs), rel=1e-6)
 
 
+def test_the_count_of_every_architecture_is_checked():
+    assert {each.network.architecture for each in GRID + RADIAL} == set(ARCHITECTURES)
+
+
 def surroundings():
-    return Surroundings.counted(2.0, 3, neighbors=40.0, boundary_neighbors=18.0, boundary_points=3.0)
+    return NeighborDensity.counted(2.0, 3, neighbors=40.0, wall_neighbors=18.0, wall_points=3.0)
 
 
 def cost(network=None, **changes):
-    settings = NetworkConfig(**(network or {}) | changes).model_dump()
-    return estimate(settings, dim=3, vector_output=False, boundary_channels=3, surroundings=surroundings())
+    features, settings, _ = configured(**(network or {}) | changes)
+    walls = Kinds(0, 1) if "walls" in features else None
+    return settings.count(kinds_of(features), walls, Kinds(1, 0), 3, surroundings())
 
 
-@pytest.mark.parametrize("basis", ["grid", "radial"])
+@pytest.mark.parametrize("architecture", ["conv_net", "radial_net"])
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -90,12 +100,12 @@ def cost(network=None, **changes):
         ("first_channels", (4, 8, 16, 32)),
         ("hidden_channels", (32, 64, 128)),
         ("relative_cutoff", (1.5, 2.0, 2.5)),
-        ("boundary", (False, True)),
+        ("walls", (False, True)),
         ("density", (False, True)),
     ],
 )
-def test_more_of_a_network_costs_more(name, values, basis):
-    costs = [cost(basis=basis, **{name: value}) for value in values]
+def test_more_of_a_network_costs_more(name, values, architecture):
+    costs = [cost(architecture=architecture, **{name: value}) for value in values]
     for quantity in ("flops_per_particle", "bytes_per_particle"):
         counts = [getattr(each, quantity) for each in costs]
         assert counts == sorted(set(counts))
@@ -109,13 +119,10 @@ def test_maps_windows_and_norms_move_memory_and_are_no_operations_of_the_network
         assert other.bytes_per_particle > plain.bytes_per_particle
 
 
-def test_networks_without_boundary_do_not_see_walls():
-    settings = NetworkConfig(boundary=False).model_dump()
-    inside = with_changes(surroundings(), boundary_density=0.0, boundary_points=0.0)
-    costs = [
-        estimate(settings, dim=3, vector_output=False, boundary_channels=channels, surroundings=around)
-        for channels, around in ((3, surroundings()), (0, inside))
-    ]
+def test_networks_without_walls_do_not_count_them():
+    inside = with_changes(surroundings(), walls=0.0, wall_points=0.0)
+    network = configured().network
+    costs = [network.count(Kinds(2, 1), None, Kinds(1, 0), 3, around) for around in (surroundings(), inside)]
     assert costs[0] == costs[1]
 
 
@@ -124,8 +131,8 @@ def test_points_within_reach_follow_from_those_counted_at_another_cutoff():
     lattice = torch.cartesian_prod(*[torch.arange(-6.0, 7.0)] * 3)
     radii = lattice.norm(dim=1)
     near, far = (int((radii <= cutoff).sum()) - 1 for cutoff in (3.5, 5.5))
-    around = Surroundings.counted(3.5, 3, near)
-    assert around.fluid_density * ball_volume(5.5, 3) == pytest.approx(far, rel=0.1)
+    around = NeighborDensity.counted(3.5, 3, near)
+    assert around.fluid * ball_volume(5.5, 3) == pytest.approx(far, rel=0.1)
 
 
 def test_volumes_of_balls():
@@ -134,9 +141,7 @@ def test_volumes_of_balls():
 
 def test_surroundings_are_counted_in_a_frame(generator):
     _, inputs = built(GRID[0], "density_rate", True, generator)
-    found = surroundings_of(inputs, 1.5)
-    assert found.fluid_density * ball_volume(1.5, 2) == pytest.approx(
-        8, abs=1
-    )  # of a lattice that is a little jittered
-    assert found.boundary_points == 8 / 64
-    assert 0 < found.boundary_density < found.fluid_density
+    found = neighbor_density(inputs, 1.5)
+    assert found.fluid * ball_volume(1.5, 2) == pytest.approx(8, abs=1)  # of a lattice that is a little jittered
+    assert found.wall_points == 8 / 64
+    assert 0 < found.walls < found.fluid

@@ -1,0 +1,137 @@
+"""What a prediction costs, known from a network's settings before anything is built: operations and memory traffic.
+
+Both are counted along the paths that `cconv.ops` takes on the CPU where nothing is differentiated. A count takes some
+ten microseconds, for searches that ask for thousands. Here are the parts that networks have in common; what a network
+is made of stands beside the network.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from cconv.nn.kinds import Kinds
+from cconv.ops.general import multiplies_first
+
+FLOAT, INDEX = 4, 8  # bytes
+ARRAY = 2 * FLOAT  # bytes that move where an array operation writes a value and the next one reads it
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeighborDensity:
+    """How many points a fluid particle of a scene has around it, on average.
+
+    Attributes:
+        fluid: Neighbours a unit of volume within reach, lengths in particle spacings; about 1 inside a fluid.
+        walls: Boundary points, likewise.
+        wall_points: Boundary points of the scene over its fluid particles.
+    """
+
+    fluid: float
+    walls: float = 0.0
+    wall_points: float = 0.0
+
+    @classmethod
+    def counted(
+        cls,
+        relative_cutoff: float,
+        dim: int,
+        neighbors: float,
+        wall_neighbors: float = 0.0,
+        wall_points: float = 0.0,
+    ) -> "NeighborDensity":
+        """From mean numbers of points within a cutoff, in particle spacings, in D dimensions."""
+        volume = ball_volume(relative_cutoff, dim)
+        return cls(fluid=neighbors / volume, walls=wall_neighbors / volume, wall_points=wall_points)
+
+    def pairs(self, relative_cutoff: float, dim: int) -> tuple["Pairs", "Pairs"]:
+        """Pairs of a receiver with the fluid and with the walls within a cutoff."""
+        volume = ball_volume(relative_cutoff, dim)
+        return Pairs(1.0, self.fluid * volume), Pairs(self.wall_points, self.walls * volume)
+
+
+def ball_volume(radius: float, dim: int) -> float:
+    """Volume of a ball in D dimensions, length^D."""
+    return math.pi ** (dim / 2) / math.gamma(dim / 2 + 1) * radius**dim
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountedCost:
+    """Cost of one particle's prediction.
+
+    Attributes:
+        flops_per_particle: Multiplications and additions of the network.
+        bytes_per_particle: Bytes moved by neighbour search, geometry and network. Filters are assumed to stay in the
+            cache, so only the values that each pair reads from them are counted.
+    """
+
+    flops_per_particle: float = 0.0
+    bytes_per_particle: float = 0.0
+
+    def __add__(self, other: "CountedCost") -> "CountedCost":
+        return CountedCost(
+            flops_per_particle=self.flops_per_particle + other.flops_per_particle,
+            bytes_per_particle=self.bytes_per_particle + other.bytes_per_particle,
+        )
+
+
+def total(parts: Iterable[CountedCost]) -> CountedCost:
+    """Sum of costs."""
+    return sum(parts, start=CountedCost())
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Sending points and pairs, of each receiver."""
+
+    senders: float
+    neighbors: float
+
+
+@dataclass(frozen=True)
+class CountedConv:
+    """A convolution whose cost is counted: what it takes, what it gives, between which points."""
+
+    inputs: Kinds
+    outputs: Kinds
+    pairs: Pairs
+
+
+def count_filters(
+    inputs: int, outputs: int, cells: int, corners: int, senders: float, neighbors: float, pair_bytes: int
+) -> CountedCost:
+    """Cost of a convolution of scalars as `cconv.ops.convolution.convolve` computes it.
+
+    Messages of a pair are added to the cells that it reads, or it reads products of the sender and all filters;
+    `pair_bytes` say where a pair reads the filters.
+    """
+    products_first = multiplies_first(senders, 1.0, inputs, outputs)
+    read = neighbors * corners * (outputs if products_first else inputs)
+    multiplied = (senders if products_first else 1.0) * cells * inputs * outputs
+    products = senders * cells * outputs * ARRAY if products_first else 0.0
+    return CountedCost(
+        flops_per_particle=2.0 * (read + multiplied) if outputs else 0.0,
+        bytes_per_particle=neighbors * (pair_bytes + inputs * FLOAT) + products + outputs * ARRAY,
+    )
+
+
+def count_linear(inputs: Kinds, outputs: Kinds, dim: int) -> CountedCost:
+    """Cost of a linear map of scalars and vectors, and of the few operations between layers."""
+    weights = inputs.scalars * outputs.scalars + dim * inputs.vectors * outputs.vectors
+    values = inputs.num_values(dim) + outputs.num_values(dim)
+    return CountedCost(flops_per_particle=2.0 * weights, bytes_per_particle=3.0 * values * ARRAY)
+
+
+def count_search(pairs: Pairs, dim: int) -> CountedCost:
+    """Cost of a neighbour search: points sorted into cells; both indices, displacement and distance of each pair."""
+    pair = 2 * INDEX + (dim + 2) * FLOAT
+    return CountedCost(bytes_per_particle=8.0 * INDEX * pairs.senders + 2.0 * pair * pairs.neighbors)
+
+
+def count_arrays(arrays: int, pairs: Pairs) -> CountedCost:
+    """Cost of so many arrays of all pairs, written and read once."""
+    return CountedCost(bytes_per_particle=float(ARRAY * arrays * pairs.neighbors))
+
+
+def window_arrays(window: str, normalize: bool) -> int:
+    """Arrays of all pairs that a window, and dividing by its sum, takes."""
+    return {"none": 1, "poly6": 6, "gaussian": 4, "cubic_spline": 14}[window] + 4 * normalize

@@ -1,0 +1,196 @@
+"""What every network has: settings that build it, its geometry, its counted cost, and, if linear, its terms."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from cconv.errors import ConfigError, ShapeError
+from cconv.neighbors import Edges
+from cconv.networks.counting import CountedCost, NeighborDensity
+from cconv.nn.continuous_conv import ConvGeometry
+from cconv.nn.kinds import Kinds
+from cconv.nn.radial_conv import RadialGeometry
+from cconv.validation import Flag, Real, StrictModel, Whole
+
+Geometry = ConvGeometry | RadialGeometry
+
+
+class LinearTerms(ABC):
+    """A network of a single layer as a linear map of its coefficients, for least squares."""
+
+    @abstractmethod
+    def terms(
+        self,
+        features: Tensor,
+        geometry: Geometry,
+        wall_features: Tensor | None = None,
+        wall_geometry: Geometry | None = None,
+    ) -> list[Tensor]:
+        """Sets of terms (R, P): an output is terms @ coefficients. Arguments as of `Network.forward`."""
+
+    @abstractmethod
+    def targets(self, target: Tensor) -> list[Tensor]:
+        """Targets (R, C) of each set of terms, of a target (N, C) of the network."""
+
+    @abstractmethod
+    def assign(self, coefficients: Sequence[Tensor]) -> None:
+        """Make coefficients (P, C) of each set those of the network."""
+
+
+def assign_rows(weights: Sequence[Tensor], values: Tensor) -> None:
+    """Copy rows of `values` (P, C) to weights whose last axis is C, in order."""
+    rows = values.split([weight.numel() // values.shape[1] for weight in weights])
+    for weight, part in zip(weights, rows, strict=True):
+        weight.copy_(part.reshape(weight.shape))
+
+
+class Network(nn.Module, ABC):
+    """Maps features of fluid particles, and of walls, to outputs at the fluid particles."""
+
+    @abstractmethod
+    def forward(
+        self,
+        features: Tensor,
+        geometry: Geometry,
+        wall_features: Tensor | None = None,
+        wall_geometry: Geometry | None = None,
+    ) -> Tensor:
+        """Outputs at the fluid particles.
+
+        Args:
+            features: Features of fluid particles, as `NetworkSettings.arrange` gives them.
+            geometry: Fluid particles seen from fluid particles.
+            wall_features: Features of wall points, only with a branch for walls.
+            wall_geometry: Wall points seen from fluid particles, only with a branch for walls.
+
+        Returns:
+            Scalars and vectors of the last layer, (N, S + V · D).
+
+        Raises:
+            ShapeError: If inputs of walls are missing, or come without a branch for them.
+        """
+
+    @abstractmethod
+    def linear_terms(self) -> LinearTerms:
+        """The network as a linear map of its coefficients.
+
+        Raises:
+            ConfigError: If it has several layers.
+        """
+
+
+def check_walls(has_branch: bool, wall_features: Tensor | None, wall_geometry: Geometry | None) -> None:
+    """Check that inputs of walls come exactly where a network has a branch for them.
+
+    Raises:
+        ShapeError: If not.
+    """
+    if has_branch != (wall_features is not None and wall_geometry is not None):
+        raise ShapeError(
+            "`wall_features` and `wall_geometry` must be given exactly when the network has a boundary branch; it has "
+            f"{'one' if has_branch else 'none'}."
+        )
+
+
+def check_single_layer(layers: int) -> None:
+    """Check that a network is linear in its coefficients.
+
+    Raises:
+        ConfigError: If it has several layers.
+    """
+    if layers != 1:
+        raise ConfigError(f"`network.layers` must be 1 for a closed form, got {layers}; train the others.")
+
+
+class NetworkSettings(StrictModel, ABC):
+    """Hyperparameters of a network of some architecture, as study files and checkpoints hold them.
+
+    `relative_cutoff` is the largest distance of two particles that see each other, in particle spacings.
+    """
+
+    is_equivariant: ClassVar[bool] = False  # to rotations and reflections, whatever its weights
+
+    architecture: str
+    relative_cutoff: Real = Field(2.25, ge=1e-3, le=10)
+
+    @abstractmethod
+    def build(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
+    ) -> Network:
+        """The network with fresh weights.
+
+        Args:
+            inputs: What a fluid particle carries; the first scalar is a constant.
+            walls: What a wall point carries; None builds no branch for walls.
+            outputs: What the network predicts.
+            dim: Number of space dimensions D.
+            generator: Source of the initial weights; None for torch's global one.
+        """
+
+    @abstractmethod
+    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+        """Features (N, S + V · D), scalars first and a constant first of all, as the network takes them."""
+
+    @abstractmethod
+    def geometry(self, edges: Edges) -> Geometry:
+        """What the network reads of pairs of particles, computed once for all layers."""
+
+    @abstractmethod
+    def has_intercept(self, outputs: Kinds) -> bool:
+        """Whether some of the output does not follow from the features, so that the target's mean may be taken off."""
+
+    @abstractmethod
+    def count(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
+    ) -> CountedCost:
+        """Cost of one particle's prediction, its features given; arguments as of `build`, and points around it."""
+
+
+class ConvolutionSettings(NetworkSettings):
+    """What networks of stacked convolutions have in common.
+
+    The layers have `first_channels`, then `hidden_channels`, and the components of the target.
+    """
+
+    layers: Whole = Field(4, ge=1, le=16)
+    first_channels: Whole = Field(32, ge=1, le=4096)
+    hidden_channels: Whole = Field(64, ge=1, le=4096)
+    window: Literal["none", "poly6", "gaussian", "cubic_spline"] = "poly6"
+    normalize: Flag = False
+    message: Literal["absolute", "difference"] = "absolute"
+    activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
+
+    @property
+    def hidden_widths(self) -> list[int]:
+        """Outputs of each layer but the last."""
+        return [self.first_channels, *[self.hidden_channels] * (self.layers - 2)] if self.layers > 1 else []
+
+    @property
+    def takes_differences(self) -> bool:
+        """Whether fluid convolutions take differences of features, to which a constant adds nothing."""
+        return self.message == "difference"
+
+    def has_intercept(self, outputs: Kinds) -> bool:
+        """Whether there are biases and a shift of the target.
+
+        A scalar from differences has none, so that it is 0 where nothing differs.
+        """
+        return not self.takes_differences or outputs.vectors > 0
+
+    def sent(self, inputs: Kinds) -> Kinds:
+        """What particles send to each other: without the constant where they send differences."""
+        return Kinds(inputs.scalars - self.takes_differences, inputs.vectors)
+
+    def own(self, inputs: Kinds, outputs: Kinds) -> Kinds:
+        """What the first layer takes of a particle itself beside its convolution, a constant apart.
+
+        A scalar from differences does not depend on it; of a vector, scalars of the particle may be factors, as the
+        density is of a density gradient.
+        """
+        if not self.takes_differences:
+            return Kinds(inputs.scalars - 1, inputs.vectors)
+        return Kinds(inputs.scalars - 1 if outputs.vectors else 0, 0)

@@ -1,0 +1,28 @@
+"""What a particle carries: scalars and vectors, the irreducible representations of rotations of degree 0 and 1."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Kinds(NamedTuple):
+    """Numbers of scalars and of vectors that a particle carries."""
+
+    scalars: int
+    vectors: int
+
+    def num_values(self, dim: int) -> int:
+        """Numbers that hold them in D dimensions: the scalars first, then the D components of each vector."""
+        return self.scalars + self.vectors * dim
+
+
+def split_kinds(values: Tensor, kinds: tuple[int, int], dim: int) -> tuple[Tensor, Tensor]:
+    """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
+    scalars, vectors = values.split([kinds[0], kinds[1] * dim], dim=1)
+    return scalars, vectors.reshape(len(values), kinds[1], dim)
+
+
+def join_kinds(scalars: Tensor, vectors: Tensor) -> Tensor:
+    """Values (N, S + V · D) of scalars (N, S) and vectors (N, V, D)."""
+    return torch.cat([scalars, vectors.flatten(1)], dim=1)

@@ -1,0 +1,29 @@
+"""D3 of the thesis: the gradient of density."""
+
+from torch import Tensor
+
+from cconv.nn.kinds import Kinds
+from cconv.sph.compiled import CompiledSums
+from cconv.sph.operators import density_gradient
+from cconv.tasks.features import FluidState, Units
+from cconv.tasks.task import FieldTask
+
+
+class DensityGradient(FieldTask):
+    """The gradient of density ∇ρ over fluid particles (thesis eq. D3)."""
+
+    name = "density_gradient"
+    symbol = "∇ρ"
+    output = Kinds(0, 1)
+
+    def field(self, state: FluidState) -> Tensor:
+        """Gradients of density (N, D)."""
+        return density_gradient(state.masses, state.densities, state.edges, state.kernel)
+
+    def unit(self, units: Units) -> float:
+        """Rest density a particle spacing."""
+        return units.density / units.length
+
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+        """Gradients of density (N, D) by compiled sums; the densities are summed first, as a user has to."""
+        return sums.density_gradient(state.masses, sums.density(state.masses, state.edges), state.edges)

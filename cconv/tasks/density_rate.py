@@ -1,0 +1,29 @@
+"""D2 of the thesis: the material rate of density."""
+
+from torch import Tensor
+
+from cconv.nn.kinds import Kinds
+from cconv.sph.compiled import CompiledSums
+from cconv.sph.operators import density_rate
+from cconv.tasks.features import FluidState, Units
+from cconv.tasks.task import FieldTask
+
+
+class DensityRate(FieldTask):
+    """The material rate of density Dρ/Dt by the continuity equation over fluid particles (thesis eq. D2)."""
+
+    name = "density_rate"
+    symbol = "Dρ/Dt"
+    output = Kinds(1, 0)
+
+    def field(self, state: FluidState) -> Tensor:
+        """Rates of density (N, 1)."""
+        return density_rate(state.masses, state.velocities, state.edges, state.kernel)[:, None]
+
+    def unit(self, units: Units) -> float:
+        """Rest density a frame's time."""
+        return units.density / units.time
+
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+        """Rates of density (N,) by compiled sums."""
+        return sums.density_rate(state.masses, state.velocities, state.edges)

@@ -1,0 +1,251 @@
+"""What a network is given: named scalars and vectors of fluid particles and wall points.
+
+Networks know no metres, kilograms or seconds: lengths are in particle spacings, densities in rest densities, times in
+intervals of stored frames. So a network holds at every resolution and in all units.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
+from cconv.domain import Box
+from cconv.errors import ShapeError
+from cconv.neighbors import Edges, radius_graph
+from cconv.nn.kinds import Kinds, join_kinds
+from cconv.sph.kernels import AbstractKernel
+from cconv.sph.operators import density
+
+CONSTANT, DENSITY, VELOCITY, NORMAL = "one", "density", "velocity", "normal"  # names of features
+WALLS = "walls"  # stands among the features of a task for those of the wall points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Units:
+    """What a network's numbers are multiples of, in the units of the data.
+
+    Attributes:
+        length: Particle spacing dx.
+        density: Rest density, mean mass of a fluid particle / dx^D.
+        time: Time between stored frames.
+    """
+
+    length: float
+    density: float
+    time: float
+
+    @property
+    def velocity(self) -> float:
+        """Spacings in a frame's time."""
+        return self.length / self.time
+
+
+def units_of(masses: Tensor, scene: Scene) -> Units:
+    """Units of a frame whose fluid particles have masses (N,)."""
+    mean_mass = float(masses.double().mean()) if len(masses) else 1.0
+    return Units(
+        length=scene.particle_spacing, density=mean_mass / scene.particle_spacing**scene.dim, time=scene.frame_dt
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """Named values of particles; scalars come first, everywhere.
+
+    Attributes:
+        scalars: (N, S).
+        vectors: (N, V, D).
+        scalar_names: Names of the scalars, S.
+        vector_names: Names of the vectors, V.
+    """
+
+    scalars: Tensor
+    vectors: Tensor
+    scalar_names: tuple[str, ...]
+    vector_names: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the scalars, then of the vectors."""
+        return self.scalar_names + self.vector_names
+
+    @property
+    def kinds(self) -> Kinds:
+        """Numbers of scalars and vectors."""
+        return Kinds(len(self.scalar_names), len(self.vector_names))
+
+    def flat(self) -> Tensor:
+        """Scalars and the components of the vectors, (N, S + V · D)."""
+        return join_kinds(self.scalars, self.vectors)
+
+    def select(self, names: Collection[str]) -> "Features":
+        """Those of some names, in their own order.
+
+        Raises:
+            ShapeError: If one is not among them.
+        """
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            raise ShapeError(
+                f"The model takes the feature {missing[0]!r}, and the inputs hold {', '.join(self.names)}."
+            )
+        if set(names) == set(self.names):
+            return self
+        scalars = [place for place, name in enumerate(self.scalar_names) if name in names]
+        vectors = [place for place, name in enumerate(self.vector_names) if name in names]
+        return Features(
+            scalars=self.scalars[:, scalars],
+            vectors=self.vectors[:, vectors],
+            scalar_names=tuple(self.scalar_names[place] for place in scalars),
+            vector_names=tuple(self.vector_names[place] for place in vectors),
+        )
+
+    def to(self, dtype: torch.dtype) -> "Features":
+        """The same in another type of numbers."""
+        return replace(self, scalars=self.scalars.to(dtype), vectors=self.vectors.to(dtype))
+
+
+def kinds_of(names: Sequence[str]) -> Kinds:
+    """How many of some features are scalars and how many vectors."""
+    return Kinds(sum(name in _SCALARS for name in names), sum(name in _VECTORS for name in names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """The fluid particles of a frame as a network sees them, in `units`.
+
+    Attributes:
+        positions: Fluid positions (N, D), particle spacings.
+        features: Features of each fluid particle; the first scalar is a constant.
+        wall_positions: (B, D), particle spacings, or None where the scene has no walls.
+        wall_features: Normals, or a constant where the data hold none; None without walls.
+        box: Bounds and periodic axes, particle spacings.
+        units: What these numbers are multiples of.
+    """
+
+    positions: Tensor
+    features: Features
+    wall_positions: Tensor | None
+    wall_features: Features | None
+    box: Box
+    units: Units
+
+    @property
+    def num_particles(self) -> int:
+        """Number of fluid particles N."""
+        return len(self.positions)
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions D."""
+        return self.positions.shape[1]
+
+    @property
+    def wall_kinds(self) -> Kinds | None:
+        """What a wall point carries; None without walls."""
+        return None if self.wall_features is None else self.wall_features.kinds
+
+    def double(self) -> "Inputs":
+        """The same in float64."""
+        walls = {}
+        if self.wall_positions is not None and self.wall_features is not None:
+            walls = {
+                "wall_positions": self.wall_positions.double(),
+                "wall_features": self.wall_features.to(torch.float64),
+            }
+        return replace(self, positions=self.positions.double(), features=self.features.to(torch.float64), **walls)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FluidState:
+    """Fluid particles of a frame in float64, as analytic SPH sees them.
+
+    Attributes:
+        positions: (N, D).
+        velocities: (N, D).
+        masses: (N,).
+        box: Bounds and periodic axes.
+        kernel: SPH kernel of densities and fields.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    masses: Tensor
+    box: Box | None
+    kernel: AbstractKernel
+
+    @cached_property
+    def edges(self) -> Edges:
+        """Pairs within the kernel's support."""
+        return radius_graph(self.positions, self.kernel.support_radius, self.box)
+
+    @cached_property
+    def densities(self) -> Tensor:
+        """Density by summation over fluid particles only (D1), as in the thesis, (N,)."""
+        return density(self.masses, self.edges, self.kernel)
+
+    def knowing(self, edges: Edges, densities: Tensor) -> "FluidState":
+        """The same particles with neighbours and densities (N,) that come from elsewhere."""
+        state = replace(self)
+        vars(state).update(edges=edges, densities=densities)
+        return state
+
+
+def fluid_state(frame: Frame, box: Box, kernel: AbstractKernel) -> FluidState:
+    """Fluid particles of a frame; neighbours and densities are computed when they are first asked for."""
+    fluid = frame.particle_types == ParticleType.FLUID
+    positions, velocities, masses = (
+        values[fluid].double() for values in (frame.positions, frame.velocities, frame.masses)
+    )
+    return FluidState(positions=positions, velocities=velocities, masses=masses, box=box, kernel=kernel)
+
+
+_SCALARS = {
+    CONSTANT: lambda state, units: torch.ones_like(state.masses),
+    DENSITY: lambda state, units: state.densities / units.density,
+}
+_VECTORS = {VELOCITY: lambda state, units: state.velocities / units.velocity}
+
+
+def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, names: Collection[str]) -> Inputs:
+    """Network inputs in float32: features of the fluid particles by name (thesis section 3.1), normals of the walls.
+
+    Args:
+        state: Fluid particles.
+        boundary: Wall points, or None.
+        scene: Scene of the frame.
+        names: Features of the fluid particles; no sum over neighbours is taken for those that are not named.
+    """
+    units = units_of(state.masses, scene)
+    corners = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
+    return Inputs(
+        positions=(state.positions / units.length).float(),
+        features=_fluid_features(state, units, names),
+        wall_positions=None if boundary is None else (boundary.positions.double() / units.length).float(),
+        wall_features=None if boundary is None else _wall_features(boundary),
+        box=Box(*corners, scene.box.periodic),
+        units=units,
+    )
+
+
+def _fluid_features(state: FluidState, units: Units, names: Collection[str]) -> Features:
+    scalars = {name: feature(state, units) for name, feature in _SCALARS.items() if name in names}
+    vectors = {name: feature(state, units) for name, feature in _VECTORS.items() if name in names}
+    return Features(
+        scalars=torch.stack([*scalars.values()], dim=1).float(),
+        vectors=torch.stack([*vectors.values()], dim=1).float(),
+        scalar_names=tuple(scalars),
+        vector_names=tuple(vectors),
+    )
+
+
+def _wall_features(boundary: Boundary) -> Features:
+    points, dim = boundary.positions.shape
+    if boundary.normals is None:
+        ones, none = torch.ones(points, 1), torch.zeros(points, 0, dim)
+        return Features(scalars=ones, vectors=none, scalar_names=(CONSTANT,), vector_names=())
+    normals = boundary.normals.float()[:, None, :]
+    return Features(scalars=torch.zeros(points, 0), vectors=normals, scalar_names=(), vector_names=(NORMAL,))

@@ -1,0 +1,57 @@
+"""What is asked of a network: what it is given, what it has to answer."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from cconv.data.trajectory import Frame, Scene
+from cconv.nn.kinds import Kinds
+from cconv.sph.compiled import CompiledSums
+from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.tasks.features import CONSTANT, DENSITY, VELOCITY, WALLS, FluidState, Inputs, Units, fluid_state, make_inputs
+
+
+@dataclass(frozen=True)
+class FieldTask(ABC):
+    """A field that analytic SPH gives as a function of the present frame.
+
+    Attributes:
+        kernel: Field name of the SPH kernel of densities and field.
+        relative_smoothing_length: Its h in particle spacings.
+    """
+
+    name: ClassVar[str]
+    symbol: ClassVar[str]  # of the field, for charts
+    output: ClassVar[Kinds]
+    features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
+    optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without
+
+    kernel: str = "cubic_spline"
+    relative_smoothing_length: float = 1.0
+
+    @abstractmethod
+    def field(self, state: FluidState) -> Tensor:
+        """Analytic field (N, C) at the fluid particles, in the units of the data."""
+
+    @abstractmethod
+    def unit(self, units: Units) -> float:
+        """What networks predict multiples of, in the units of the data."""
+
+    @abstractmethod
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+        """The field as a user computes it who wants it fast, from particles in float32; timed beside the networks."""
+
+    def kernel_at(self, particle_spacing: float, dim: int) -> AbstractKernel:
+        """SPH kernel in data of some particle spacing."""
+        return kernel_named(self.kernel)(self.relative_smoothing_length * particle_spacing, dim)
+
+    def state(self, frame: Frame, scene: Scene) -> FluidState:
+        """Fluid particles of a frame as the analytic field needs them."""
+        return fluid_state(frame, scene.box, self.kernel_at(scene.particle_spacing, scene.dim))
+
+    def inputs(self, frame: Frame, scene: Scene, names: Collection[str]) -> Inputs:
+        """What a network that takes some features is given of a frame."""
+        return make_inputs(self.state(frame, scene), frame.boundary, scene, names)
