@@ -73,7 +73,7 @@ def fit(
     from cconv.models.checkpoint import save_model
     from cconv.models.closed_form import solve_closed_form
     from cconv.models.errors import frame_errors, normalized_mse
-    from cconv.study.declared.stage_tables import Ridge
+    from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
 
     check_setting(Ridge, ridge, "--ridge")
@@ -197,8 +197,8 @@ def report(path: RunPath) -> None:
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report
-    from cconv.study.records.recorded import recorded_space, recorded_study
     from cconv.study.records.run_folder import RunFolder
+    from cconv.study.studies import recorded_space, recorded_study
 
     run = RunFolder.open(path)
     recorded_study(run), recorded_space(run)  # whose every key the page may show
@@ -218,8 +218,8 @@ def report(path: RunPath) -> None:
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
-    from cconv.study.declared.study_file import load_study
     from cconv.study.running.problem import load_problem, open_study_data, with_data_path
+    from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
     if data is not None:

@@ -1,20 +1,17 @@
 """Study files: what to learn, from which data, how to search. TOML, validated."""
 
 import os
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from cconv.errors import LONGEST_SHOWN, ConfigError, did_you_mean, shown, visible
-from cconv.files import DEEPEST, parse_toml, read_toml
+from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.models.model import NetworkConfig
 from cconv.sph.kernels import KERNELS
-from cconv.study.declared.stage_tables import Stage, check_names, check_order, default_stages, included
-from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole, validated
+from cconv.study.declared.stage import Stage, check_names, check_order, included
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
@@ -124,8 +121,13 @@ class SeedsConfig(StrictModel):
 
 
 class StudyConfig(StrictModel):
-    """A whole study."""
+    """A whole study, whatever kinds of stages there are: `studies` makes the form of a study file from their list.
 
+    Attributes:
+        kinds: All kinds of stages that a study file can ask for.
+    """
+
+    kinds: ClassVar[tuple[str, ...]] = ()
     name: Name
     task: Literal["density_rate", "density_gradient"]
     data: DataConfig = DataConfig()
@@ -136,7 +138,7 @@ class StudyConfig(StrictModel):
     cost: CostConfig = CostConfig()
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
-    stages: dict[Name, Stage] = Field(default_factory=default_stages, min_length=1, max_length=100)
+    stages: dict[Name, Stage]
 
     @field_validator("stages", mode="before")
     @classmethod
@@ -148,7 +150,7 @@ class StudyConfig(StrictModel):
     @field_validator("stages")
     @classmethod
     def _stages_read_earlier_ones(cls, stages: dict[str, Stage]) -> dict[str, Stage]:
-        check_names(stages)
+        check_names(stages, cls.kinds)
         check_order(stages)
         return stages
 
@@ -221,51 +223,3 @@ def configure(
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"])) or "together"
         raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
-
-
-def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
-    """Study from a TOML file; its search space is looked for beside the file, then in the working folder.
-
-    Args:
-        path: The study file.
-        overrides: Settings that replace the file's, as ``"training.updates=100"``; values in TOML or plain text.
-
-    Raises:
-        ConfigError: If the file cannot be read or a key or value does not fit.
-    """
-    path = Path(path)
-    values = read_toml(path)
-    for override in overrides:
-        _apply(values, override)
-    study = validated(StudyConfig, values, path)
-    space = path.parent / study.search.space
-    if space.is_file():
-        study = study.model_copy(update={"search": study.search.model_copy(update={"space": str(space)})})
-    return study
-
-
-def _apply(values: dict, override: str) -> None:
-    name, equals, text = override.partition("=")
-    setting = f"--set {visible(override)[:LONGEST_SHOWN]}"
-    if not equals:
-        raise ConfigError(f"{setting}: must read key=value, e.g. training.updates=100.")
-    if name.count(".") >= DEEPEST:
-        raise ConfigError(f"{setting}: a key of more than {DEEPEST} parts; see the study file for its keys.")
-    *tables, key = name.strip().split(".")
-    for table in tables:
-        values = values.setdefault(table, {})
-        if not isinstance(values, dict):
-            raise ConfigError(f"{setting}: `{table}` is not a table; see the study file for its keys.")
-    values[key] = _value(text, setting)
-
-
-def _value(text: str, setting: str) -> object:
-    """A value in TOML, or else the text itself."""
-    if "\n" in text:
-        raise ConfigError(f"{setting}: must be one line.")
-    try:
-        return parse_toml(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-    except ValueError as error:
-        raise ConfigError(f"{setting}: no value for a setting ({error}).") from error

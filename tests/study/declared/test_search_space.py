@@ -8,8 +8,9 @@ from cconv.evaluation.cost_model import Estimate
 from cconv.models.model import NetworkConfig
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
 from cconv.study.declared.search_space import check_baseline_affordable, load_space
-from cconv.study.declared.study_file import TrainingConfig, configure, load_study
+from cconv.study.declared.study_file import TrainingConfig, configure
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
+from cconv.study.studies import load_study
 
 REPOSITORY = Path(__file__).parents[3]
 SPACES = sorted((REPOSITORY / "search_spaces").glob("*.toml"))

@@ -13,7 +13,15 @@ from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.stages import closed_form
-from cconv.study.stages.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, layer_id, propose, single_layers
+from cconv.study.stages.closed_form import (
+    BRANCHES,
+    _draw,
+    _neighbors,
+    layer_id,
+    propose,
+    single_layers,
+    without_unneeded_branches,
+)
 
 
 def space_of(**parameters):
@@ -113,7 +121,7 @@ def run(finished_run):
 
 
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
-    screened = [record for record in run.trials() if record.stage == STAGE]
+    screened = [record for record in run.trials() if record.stage == "closed_form"]
     best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
     entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
     (record,) = run.retrainings()[entry["id"]]
@@ -148,7 +156,7 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
     study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True, "density": True})
-    finalist, parameters = _lean(session, candidate, seed=1, ridge=0.0)
+    finalist, parameters = without_unneeded_branches(session, candidate, seed=1, ridge=0.0)
     assert " ".join(branch for branch in BRANCHES if parameters[branch]) == kept
     assert finalist == "found" + "".join(f"_no_{branch}" for branch in BRANCHES if not parameters[branch])
     assert session.run.finalist(finalist, 1).parameters == parameters
@@ -164,13 +172,13 @@ def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkey
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(boundary=[True]))
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "boundary": True})
-    assert _lean(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
+    assert without_unneeded_branches(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
     assert fitted == [candidate.parameters]
 
 
 def test_candidates_go_on_from_the_would_be_finalists(run):
     """Of four candidates the last two are one change away from the best of those before them."""
-    records = run.trials_of(STAGE)
+    records = run.trials_of("closed_form")
     best = min(records[:2], key=lambda record: record.best)
     for record in records[2:]:
         parents = [best, *records[2:]]
