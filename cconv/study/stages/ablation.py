@@ -20,7 +20,7 @@ from cconv.validation import Whole
 
 
 class AblationStage(Stage):
-    """Retrainings between the baseline and the best finalist, and of the best finalist without each of its parts."""
+    """Retrain models between the baseline and the best finalist, and the best finalist without each of its parts."""
 
     kind: Literal["ablation"] = "ablation"
     uses = ("initialization", "random", "finalists")

@@ -14,7 +14,10 @@ from cconv.validation import Value
 
 
 class AdaptiveStage(SearchStage):
-    """Tree-structured Parzen estimator with ASHA for error and cost, which learns from the stages that it reads."""
+    """Search with ASHA by a tree-structured Parzen estimator of error and cost.
+
+    The estimator learns from the stages that this one reads and from the trials before each trial.
+    """
 
     kind: Literal["adaptive"] = "adaptive"
     uses = ("baseline", "initialization", "random")

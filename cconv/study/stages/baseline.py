@@ -8,7 +8,7 @@ from cconv.study.stages.session import Session
 
 
 class BaselineStage(Stage):
-    """The published network, trained to the full budget as every trial could be."""
+    """Train the published network to the full budget, as every trial could be."""
 
     kind: Literal["baseline"] = "baseline"
 

@@ -42,7 +42,7 @@ _OF_BASIS = {"grid": ("kernel_size", "mapping", "interpolation", "align_corners"
 
 
 class ClosedFormStage(Stage):
-    """Least squares for the single linear layers of the space.
+    """Fit the single linear layers of the space by least squares.
 
     At most `max_candidates` layers are fitted to `screening_frames` frames, ranges sampled at `values_per_range`
     places; the `count` best are fitted to all frames and become finalists.

@@ -20,7 +20,7 @@ from cconv.validation import Name, Whole
 
 
 class ConvergeStage(Stage):
-    """Trains finalists with each of `budgets` (gradient updates, ascending) until more no longer lowers the error.
+    """Train finalists with each of `budgets` (gradient updates, ascending) until more no longer lowers the error.
 
     `of` names the baseline or configurations that a stage of finalists includes; None means every trained finalist.
     """

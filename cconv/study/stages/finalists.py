@@ -70,7 +70,7 @@ class Retrained:
 
 
 class FinalistsStage(Stage):
-    """The `count` best trained configurations, the best closed forms and the baseline, retrained with fresh seeds.
+    """Retrain the `count` best configurations and the baseline with fresh seeds; fit the best closed forms.
 
     `include` names further configurations, e.g. a published one, by the id that they get.
     """

@@ -9,7 +9,7 @@ SHOWN = 6  # parameters whose partial dependence is kept
 
 
 class ImportanceStage(Stage):
-    """Importance of the hyperparameters at each rung of the random searches that it reads, with a noise floor."""
+    """Estimate how important hyperparameters are at each rung of the random searches read, with a noise floor."""
 
     kind: Literal["importance"] = "importance"
     uses = ("random",)

@@ -22,9 +22,9 @@ from cconv.validation import Whole
 
 
 class InitializationStage(Stage):
-    """Trainings that nothing stops: the baseline with `seeds` initial weights, `configurations` of the space with one.
+    """Train the baseline with `seeds` initial weights, and `configurations` of the space with one; stop nothing.
 
-    They tell the variance over initial weights from that over configurations, and serve as the audit of the rungs.
+    The trainings tell the variance over initial weights from that over configurations, and audit the rungs.
     """
 
     kind: Literal["initialization"] = "initialization"

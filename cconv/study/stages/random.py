@@ -11,7 +11,7 @@ from cconv.study.stages.session import Session
 
 
 class RandomStage(SearchStage):
-    """Random search with ASHA, in the study's space or in the one that the stage `space` refined."""
+    """Search at random with ASHA, in the study's space or in the one that the stage `space` refined."""
 
     kind: Literal["random"] = "random"
 

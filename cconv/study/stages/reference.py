@@ -16,7 +16,7 @@ from cconv.study.stages.session import Session
 
 
 class ReferenceStage(Stage):
-    """The budget of each search that it reads, spent by another rule: each trial a little, the best to the end."""
+    """Spend the budget of each search that is read by another rule: each trial a little, the best to the end."""
 
     kind: Literal["reference"] = "reference"
     uses = ("random", "adaptive")

@@ -8,7 +8,7 @@ from cconv.study.stages.session import Session
 
 
 class RefineStage(Stage):
-    """Narrows the space from the records that it reads, with a reason for each parameter."""
+    """Narrow the space from the records that are read, with a reason for each parameter."""
 
     kind: Literal["refine"] = "refine"
     uses = ("baseline", "initialization", "random")

@@ -43,7 +43,7 @@ GROWTH_REPEATS = 3
 
 
 class SelectStage(Stage):
-    """Tests, times and stresses the finalists and recommends one."""
+    """Test, time and stress the finalists and recommend one."""
 
     kind: Literal["select"] = "select"
     uses = ("finalists", "converge")
