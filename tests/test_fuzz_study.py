@@ -21,10 +21,10 @@ from torch import Generator
 
 from cconv.models.checkpoint import save_model
 from cconv.study.declared.search_space import load_space
-from cconv.study.declared.study_file import load_study
 from cconv.study.pipeline import begin_study
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.problem import provenance, with_data_path
+from cconv.study.studies import load_study
 
 REPOSITORY = SMOKE.parents[1]
 STUDY = SMOKE.read_text()

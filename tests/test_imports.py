@@ -26,10 +26,10 @@ TIERS = [
     {"cli"},
     {"__main__"},
 ]
-STUDY_TIERS = [{"declared"}, {"records"}, {"evidence", "running"}, {"stages"}, {"pipeline"}]
+STUDY_TIERS = [{"declared"}, {"records"}, {"evidence", "running"}, {"stages"}, {"studies"}, {"pipeline"}]
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 STUDY = [path for path in MODULES if path.is_relative_to(PACKAGE / "study") and path.parent != PACKAGE / "study"]
-STUDY.append(PACKAGE / "study" / "pipeline.py")
+STUDY += [PACKAGE / "study" / "studies.py", PACKAGE / "study" / "pipeline.py"]
 NUMERICS = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in {"sph", "nn", "ops"}]
 
 

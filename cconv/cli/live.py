@@ -26,7 +26,7 @@ class _Row:
 
 @dataclass
 class StudyDisplay:
-    """Shows the trials of a study as they run; an `Observer` of `cconv.study.stages.search`.
+    """Shows the trials of a study as they run; an `Observer` of `cconv.study.running.observer`.
 
     Attributes:
         console: Where to draw.

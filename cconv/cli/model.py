@@ -74,7 +74,7 @@ def fit(
     from cconv.models.checkpoint import save_model
     from cconv.models.closed_form import solve_closed_form
     from cconv.models.errors import frame_errors, normalized_mse
-    from cconv.study.declared.stage_tables import Ridge
+    from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
 
     check_setting(Ridge, ridge, "--ridge")
@@ -161,17 +161,18 @@ def evaluate(
 
 def _errors_on(model, progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
     """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
-    from cconv.evaluation import metrics
+    from cconv.evaluation.metrics import own_variance, per_frame_normalized_mse
+    from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 
-    frames = metrics.frame_errors(model, progress)
-    mse, variance = metrics.normalized_mse(frames), metrics.own_variance(model, samples)
-    mean = None if training is None else metrics.normalized_mse(metrics.mean_predictor_error(samples, training))
+    frames = frame_errors(model, progress)
+    mse, variance = normalized_mse(frames), own_variance(model, samples)
+    mean = None if training is None else normalized_mse(mean_predictor_error(samples, training))
     return {
         "normalized_mse": mse,
         "relative_rmse": mse**0.5,
         "own_normalized_mse": mse / variance if variance > 0 else None,
         "mean_predictor_normalized_mse": mean,
-        "per_frame_normalized_mse": metrics.per_frame_normalized_mse(frames),
+        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
     }
 
 
@@ -198,8 +199,8 @@ def report(path: RunPath) -> None:
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report
-    from cconv.study.records.recorded import recorded_space, recorded_study
     from cconv.study.records.run_folder import RunFolder
+    from cconv.study.studies import recorded_space, recorded_study
 
     run = RunFolder.open(path)
     recorded_study(run), recorded_space(run)  # whose every key the page may show
@@ -219,8 +220,8 @@ def report(path: RunPath) -> None:
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
-    from cconv.study.declared.study_file import load_study
     from cconv.study.running.problem import load_problem, open_study_data, with_data_path
+    from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
     if data is not None:

@@ -74,10 +74,10 @@ def run(
     after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
     from cconv.study.declared.search_space import load_space
-    from cconv.study.declared.study_file import load_study
     from cconv.study.pipeline import begin_study
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.running.problem import open_study_data, with_data_path
+    from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
     if data is not None:

@@ -2,7 +2,7 @@
 
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from cconv.data.plausibility import dataset_findings
@@ -10,45 +10,22 @@ from cconv.errors import ConfigError
 from cconv.models.errors import mean_predictor_error, normalized_mse
 from cconv.study.declared.domains import SearchSpace, fixed
 from cconv.study.declared.search_space import check_baseline_affordable
-from cconv.study.declared.stage_tables import Trials, readers_of
+from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
-from cconv.study.records.recorded import recorded_space, recorded_study
 from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import database_answers, open_mirror
 from cconv.study.running.problem import load_problem, open_study_data, with_data_path
 from cconv.study.running.ray_pool import ray_pool, remove_left_behind
-from cconv.study.stages.ablation import ablate
-from cconv.study.stages.analysis_stages import measure_importance, refine_space
-from cconv.study.stages.baseline import train_baseline
-from cconv.study.stages.closed_form import screen_closed_forms
-from cconv.study.stages.converge import train_longer
-from cconv.study.stages.finalists import retrain_finalists
-from cconv.study.stages.initialization import train_unstopped
-from cconv.study.stages.search import adaptive_search, random_search, spend_otherwise
-from cconv.study.stages.select import select
+from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
+from cconv.study.studies import recorded_space, recorded_study
 from cconv.tasks.features import WALLS
 from cconv.validation import check_setting
 
 RAY_FILES = "ray"  # folder in that of the run
-
-STAGES: Mapping[str, Callable[[Session, str], dict]] = {
-    "closed_form": screen_closed_forms,
-    "initialization": train_unstopped,
-    "baseline": train_baseline,
-    "random": random_search,
-    "reference": spend_otherwise,
-    "refine": refine_space,
-    "importance": measure_importance,
-    "adaptive": adaptive_search,
-    "finalists": retrain_finalists,
-    "ablation": ablate,
-    "converge": train_longer,
-    "select": select,
-}
 
 
 def begin_study(study: StudyConfig, space: SearchSpace, run: RunFolder) -> None:
@@ -93,7 +70,7 @@ def run_study(
                 for stage, settings in study.stages.items():
                     if not run.has_result(stage):
                         run.set_state("running", stage)
-                        _run_stage(session, stage, settings.kind)
+                        _run_stage(session, stage, settings)
         except BaseException as error:
             run.set_state("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", stage)
             raise
@@ -110,8 +87,8 @@ def extend_study(run: RunFolder, stage: str, trials: int) -> None:
     with run.locked():
         study = recorded_study(run)
         settings = study.stages.get(stage)
-        if getattr(settings, "trials", None) is None:
-            searches = [name for name, each in study.stages.items() if hasattr(each, "trials")]
+        if not isinstance(settings, SearchStage):
+            searches = [name for name, each in study.stages.items() if isinstance(each, SearchStage)]
             raise ConfigError(f"{run.path}: no search {stage!r} to extend; searches: {', '.join(searches) or 'none'}.")
         check_setting(Trials, settings.trials + trials, "--trials, with those of the study")
         extended = settings.model_copy(update={"trials": settings.trials + trials})
@@ -139,10 +116,10 @@ def write_study(run: RunFolder, study: StudyConfig) -> None:
     run.write("study.json", {"format": FORMAT, "id": written["id"], **study.model_dump(mode="json")})
 
 
-def _run_stage(session: Session, stage: str, kind: str) -> None:
+def _run_stage(session: Session, name: str, stage: Stage) -> None:
     start = time.perf_counter()
-    result = STAGES[kind](session, stage)
-    session.run.write(f"stages/{stage}.json", {"kind": kind, "seconds": time.perf_counter() - start, **result})
+    result = stage.run(session, name)
+    session.run.write(f"stages/{name}.json", {"kind": stage.kind, "seconds": time.perf_counter() - start, **result})
 
 
 @contextmanager
@@ -166,7 +143,7 @@ def _session(
         space = fixed(space, WALLS)  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
-    searches = [name for name, stage in study.stages.items() if stage.kind in ("random", "adaptive")]
+    searches = [name for name, stage in study.stages.items() if isinstance(stage, SearchStage)]
     records = [record for record in run.trials() if record.stage in searches]
     pools = []
     with ExitStack() as stack:

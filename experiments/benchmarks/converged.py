@@ -23,11 +23,12 @@ from cconv.models.checkpoint import load_model
 from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.report.plots import budget_chart
 from cconv.study.declared.search_space import load_space
-from cconv.study.declared.stage_tables import BASELINE
-from cconv.study.declared.study_file import StudyConfig, load_study
+from cconv.study.declared.stage import BASELINE
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
 from cconv.study.running.trial import run_trial
+from cconv.study.studies import load_study
 
 STUDY = Path(__file__).parents[1] / "dpi_converged.toml"
 RESULTS = Path(__file__).parent / "results" / "converged"

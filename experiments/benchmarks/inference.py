@@ -23,18 +23,18 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
-from cconv.data.targets import Sample, make_sample
 
 from cconv import open_dataset, radius_graph
 from cconv.data.trajectory import Frame, Scene
 from cconv.domain import Box
 from cconv.evaluation.cost import neighbor_density
 from cconv.models.checkpoint import load_model, save_model
-from cconv.models.model import Model, NetworkConfig, build_model
+from cconv.models.model import Model, build_model
 from cconv.nn.kinds import Kinds
 from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.tasks import task_named
 from cconv.tasks.features import WALLS, kinds_of
+from cconv.tasks.samples import Sample, make_sample
 
 SPACING = 0.05
 DIM = 3
@@ -96,14 +96,10 @@ class Calls:
     def __init__(self, folder: Path, searches: list[tuple[int, int, bool]]):
         scene, frame = frame_of(folder)
         sample = sample_of(scene, frame)
-        self.known = set(NetworkConfig.model_fields)
         self.calls = {}
         for name, settings in COMPARED.items():
-            inputs, network = sample.inputs, {key: value for key, value in settings.items() if key in self.known}
-            if len(network) < len(settings):  # a state that knows no models without walls: a scene without
-                inputs = type(inputs)(**vars(inputs) | {"boundary_positions": None, "boundary_features": None})
-            model = model_of(network, scene, Sample(**vars(sample) | {"inputs": inputs}))
-            self.calls[name] = lambda model=model, inputs=inputs: self.predict(model, inputs)
+            model = model_of(settings, scene, sample)
+            self.calls[name] = lambda model=model: self.predict(model, sample.inputs)
         for search in searches:
             positions, box = cloud(*search)
             self.calls[json.dumps(search)] = lambda positions=positions, box=box: self.search(positions, box)

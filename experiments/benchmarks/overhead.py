@@ -15,12 +15,13 @@ from pathlib import Path
 
 import torch
 
-from cconv.study.declared.study_file import StudyConfig, load_study
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem, load_problem, open_study_data, provenance, with_data_path
 from cconv.study.running.ray_pool import ray_pool
 from cconv.study.running.trial import run_trial
 from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
+from cconv.study.studies import load_study
 
 SMOKE = Path(__file__).parents[1] / "smoke.toml"
 ONE_UPDATE = ("training.updates=1", "training.evaluate_every=1", "search.grace_updates=1")

@@ -1,16 +1,13 @@
 """Study files: what to learn, from which data, how to search. TOML, validated."""
 
 import os
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, field_validator, model_validator
 
-from cconv.errors import LONGEST_SHOWN, ConfigError, visible
-from cconv.files import DEEPEST, parse_toml, read_toml
+from cconv.errors import ConfigError
 from cconv.networks import ConvNetSettings, NetworkTable
 from cconv.study.declared.configuration import (
     Configuration,
@@ -20,8 +17,8 @@ from cconv.study.declared.configuration import (
     check_known,
     configure,
 )
-from cconv.study.declared.stage_tables import Stage, check_names, check_order, default_stages, included
-from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Whole, validated
+from cconv.study.declared.stage import Stage, check_names, check_order, included
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Whole
 
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
 _Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
@@ -109,8 +106,13 @@ class SeedsConfig(StrictModel):
 
 
 class StudyConfig(StrictModel):
-    """A whole study."""
+    """A whole study, whatever kinds of stages there are: `studies` makes the form of a study file from their list.
 
+    Attributes:
+        kinds: All kinds of stages that a study file can ask for.
+    """
+
+    kinds: ClassVar[tuple[str, ...]] = ()
     name: Name
     task: TaskConfig
     data: DataConfig = DataConfig()
@@ -121,7 +123,7 @@ class StudyConfig(StrictModel):
     cost: CostConfig = CostConfig()
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
-    stages: dict[Name, Stage] = Field(default_factory=default_stages, min_length=1, max_length=100)
+    stages: dict[Name, Stage]
 
     @field_validator("task", mode="before")
     @classmethod
@@ -143,7 +145,7 @@ class StudyConfig(StrictModel):
     @field_validator("stages")
     @classmethod
     def _stages_read_earlier_ones(cls, stages: dict[str, Stage]) -> dict[str, Stage]:
-        check_names(stages)
+        check_names(stages, cls.kinds)
         check_order(stages)
         return stages
 
@@ -191,53 +193,3 @@ class StudyConfig(StrictModel):
 def task_table(task: object) -> object:
     """The table of a task of which a study file gives the name alone."""
     return {"name": task} if isinstance(task, str) else task
-
-
-def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
-    """Study from a TOML file; its search space is looked for beside the file, then in the working folder.
-
-    Args:
-        path: The study file.
-        overrides: Settings that replace the file's, as ``"training.updates=100"``; values in TOML or plain text.
-
-    Raises:
-        ConfigError: If the file cannot be read or a key or value does not fit.
-    """
-    path = Path(path)
-    values = read_toml(path)
-    if "task" in values:
-        values["task"] = task_table(values["task"])  # so that settings of it can be replaced
-    for override in overrides:
-        _apply(values, override)
-    study = validated(StudyConfig, values, path)
-    space = path.parent / study.search.space
-    if space.is_file():
-        study = study.model_copy(update={"search": study.search.model_copy(update={"space": str(space)})})
-    return study
-
-
-def _apply(values: dict, override: str) -> None:
-    name, equals, text = override.partition("=")
-    setting = f"--set {visible(override)[:LONGEST_SHOWN]}"
-    if not equals:
-        raise ConfigError(f"{setting}: must read key=value, e.g. training.updates=100.")
-    if name.count(".") >= DEEPEST:
-        raise ConfigError(f"{setting}: a key of more than {DEEPEST} parts; see the study file for its keys.")
-    *tables, key = name.strip().split(".")
-    for table in tables:
-        values = values.setdefault(table, {})
-        if not isinstance(values, dict):
-            raise ConfigError(f"{setting}: `{table}` is not a table; see the study file for its keys.")
-    values[key] = _value(text, setting)
-
-
-def _value(text: str, setting: str) -> object:
-    """A value in TOML, or else the text itself."""
-    if "\n" in text:
-        raise ConfigError(f"{setting}: must be one line.")
-    try:
-        return parse_toml(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-    except ValueError as error:
-        raise ConfigError(f"{setting}: no value for a setting ({error}).") from error

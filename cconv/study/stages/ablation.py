@@ -1,59 +1,79 @@
 """The ablation stage: what each change between the baseline and the best model brings, by real retrainings.
 
 One path changes one hyperparameter after another from the baseline to the best trained finalist. And the best finalist
-of all is built anew with each of its branches and features turned over: what it has left out, what it lacks added.
+of all is built anew with each of its branches and features toggled: what it has is left out, what it lacks is added.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from cconv.study.declared.configuration import configure
-from cconv.study.declared.stage_tables import BASELINE, reads_of
+from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.ablation_path import ablation_order, path_configurations
 from cconv.study.evidence.surrogate import FEWEST_TRIALS
 from cconv.study.stages.closed_form import fit_whole
 from cconv.study.stages.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
-from cconv.study.stages.search import train_all
+from cconv.study.stages.jobs import train_all
 from cconv.study.stages.session import Session
 from cconv.tasks.features import WALLS
+from cconv.validation import Whole
 
 
-def ablate(session: Session, stage: str) -> dict:
-    """Retrain the path and the turned-over models; returns "ablation" with "path" and "branches".
+class AblationStage(Stage):
+    """Retrain models between the baseline and the best finalist, and the best finalist without each of its parts."""
 
-    A step of the path above the space's caps on cost is not trained and has no error.
-    """
-    finalists = _finalists(session, stage)
-    trained = [finalist for finalist in finalists if not finalist.records[0].is_closed_form]
-    found = [finalist for finalist in trained if finalist.id != BASELINE]
-    path = _path(session, stage, found) if found else {}
-    best = min(finalists, key=_mean_error)
-    branches = _turned_over(session, best)
-    seeds, first = session.study.stages[stage].seeds, session.study.seeds.init + 1
-    to_train = path if best.records[0].is_closed_form else path | branches
-    affordable = {name: each for name, each in to_train.items() if session.affordable(each)}
-    jobs = finalist_jobs(
-        [Finalist(id=f"{stage}_{name}", parameters=each) for name, each in affordable.items()],
-        seeds,
-        first,
-        session.run,
-    )
-    train_all(session, stage, jobs, finalist_training(session.study))
-    if best.records[0].is_closed_form:
-        for name, parameters in branches.items():
-            folder = session.run.finalist(f"{stage}_{name}", first)
-            fit_whole(session, parameters, folder, stage, first, best.records[0].config["ridge"])
-    return {
-        "ablation": {
-            "of": best.id,
-            "path": [_entry(session, f"{stage}_{name}", name, each) for name, each in path.items()],
-            "branches": [
-                _entry(session, f"{stage}_{name}", name, each) | {"left_out": name, "of": _mean_error(best)}
-                for name, each in branches.items()
-            ],
+    kind: Literal["ablation"] = "ablation"
+    uses = ("initialization", "random", "finalists")
+    needs_records = True
+    seeds: Whole = Field(1, ge=1, le=1000)
+
+    def run(self, session: Session, name: str) -> dict:
+        """Retrain the path and the toggled models; returns "ablation" with "of", "path" and "branches".
+
+        A step of the path above the space's caps on cost is not trained and has no error.
+        """
+        finalists = _finalists(session, name)
+        trained = [finalist for finalist in finalists if not finalist.records[0].is_closed_form]
+        found = [finalist for finalist in trained if finalist.id != BASELINE]
+        path = _path(session, name, found) if found else {}
+        best = min(finalists, key=_mean_error)
+        branches = toggled(session, best)
+        if best.records[0].is_closed_form:
+            self._train(session, name, path)
+            _fit(session, name, branches, best.records[0].config["ridge"])
+        else:
+            self._train(session, name, path | branches)
+        return {
+            "ablation": {
+                "of": best.id,
+                "path": [_entry(session, name, change, each) for change, each in path.items()],
+                "branches": [
+                    _entry(session, name, branch, each) | {"left_out": branch, "of": _mean_error(best)}
+                    for branch, each in branches.items()
+                ],
+            }
         }
-    }
+
+    def _train(self, session: Session, name: str, models: Mapping[str, dict]) -> None:
+        """Train the models that the space's caps on cost allow."""
+        study = session.study
+        affordable = [
+            Finalist(id=f"{name}_{change}", parameters=each)
+            for change, each in models.items()
+            if session.affordable(each)
+        ]
+        jobs = finalist_jobs(affordable, self.seeds, study.seeds.init + 1, session.run)
+        train_all(session, name, jobs, finalist_training(study))
+
+
+def _fit(session: Session, stage: str, models: Mapping[str, dict], ridge: float) -> None:
+    """Fit the models as closed forms."""
+    seed = session.study.seeds.init + 1  # names the folder, as that of trained ones
+    for change, parameters in models.items():
+        fit_whole(session, parameters, session.run.finalist(f"{stage}_{change}", seed), stage, seed, ridge)
 
 
 def _finalists(session: Session, stage: str) -> list[Retrained]:
@@ -68,6 +88,7 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
     The order comes from a surrogate of the errors at the highest rung that enough trials reached; none where the study
     is too small for that.
     """
+
     best, baseline = min(found, key=_mean_error).records[0].parameters, session.space.baseline
     known = session.read(stage, "initialization", "random")
     errors = {updates: [record.error_at(updates) for record in known] for updates in session.study.rungs}
@@ -81,8 +102,8 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
     return dict(zip([BASELINE, *order], configurations, strict=True))
 
 
-def _turned_over(session: Session, best: Retrained) -> dict[str, dict]:
-    """The best finalist with each branch or feature that the scene offers turned over."""
+def toggled(session: Session, best: Retrained) -> dict[str, dict]:
+    """Hyperparameters of the best finalist with each branch or feature that the scene offers toggled, by its name."""
     parameters = best.records[0].parameters
     features = configure(parameters, session.study.configuration).features
     optional = session.problem.task.optional
@@ -90,8 +111,8 @@ def _turned_over(session: Session, best: Retrained) -> dict[str, dict]:
     return {name: parameters | {name: name not in features} for name in offered}
 
 
-def _entry(session: Session, finalist: str, change: str, parameters: Mapping) -> dict:
-    records = session.run.retrainings().get(finalist, [])
+def _entry(session: Session, stage: str, change: str, parameters: Mapping) -> dict:
+    records = session.run.retrainings().get(f"{stage}_{change}", [])
     errors = [record.best for record in records if record.outcome == "completed"]
     return {
         "change": change,

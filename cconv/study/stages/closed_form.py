@@ -12,8 +12,10 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, chain
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from cconv.data.splits import evenly_spaced
 from cconv.errors import ConfigError
@@ -23,23 +25,72 @@ from cconv.models.errors import frame_errors, normalized_mse
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import OPTIONAL_FEATURES, configure
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
-from cconv.study.declared.stage_tables import reads_of
+from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
 from cconv.study.records.trials import TrialFolder, TrialRecord
-from cconv.study.running.problem import provenance
+from cconv.study.running.problem import Problem, provenance
 from cconv.study.running.trial import describe
-from cconv.study.stages.search import trial_name
+from cconv.study.stages.jobs import trial_name
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
-from cconv.validation import Value
+from cconv.validation import Value, Whole
 
-STAGE = "closed_form"
 MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
 _OF_ANY = ("architecture", "relative_cutoff", "window", "normalize", "message", *OPTIONAL_FEATURES)
 _OF_ARCHITECTURE = {
     "conv_net": ("kernel_size", "mapping", "interpolation", "align_corners"),
     "radial_net": ("radial_terms",),
 }
+
+
+class ClosedFormStage(Stage):
+    """Fit the single linear layers of the space by least squares.
+
+    At most `max_candidates` layers are fitted to `screening_frames` frames, ranges sampled at `values_per_range`
+    places; the `count` best are fitted to all frames and become finalists.
+    """
+
+    kind: Literal["closed_form"] = "closed_form"
+    count: Whole = Field(3, ge=1, le=1000)
+    max_candidates: Whole = Field(200, ge=1, le=10_000)
+    screening_frames: Whole = Field(4, ge=1, le=10_000)
+    values_per_range: Whole = Field(3, ge=2, le=100)
+    ridge: Ridge = 1e-10
+
+    def run(self, session: Session, name: str) -> dict:
+        """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
+
+        Half of them are drawn from all layers that the space holds, as many of each architecture; the others are
+        proposed from the records of those before.
+        """
+        layers = single_layers(session.space, session.study.network, self.values_per_range)
+        samples = self._screening_samples(session.problem)
+        untried = {layer_id(layer): layer for layer in layers}
+        batch = _draw(layers, (self.max_candidates + 1) // 2, session.seed_of(name))
+        number = 0
+        while batch and number < self.max_candidates:
+            for layer in batch:
+                del untried[layer_id(layer)]
+            affordable = [layer for layer in batch if session.affordable(layer)][: self.max_candidates - number]
+            for layer in session.progress(affordable, "closed forms"):
+                folder = session.run.trial(trial_name(name, number))
+                _fit_and_record(session, layer, samples, folder, name, session.study.seeds.init, self.ridge)
+                number += 1
+            batch = propose(self.winners(session, name), list(untried.values()))
+        return {}
+
+    def winners(self, session: Session, name: str) -> list[TrialRecord]:
+        """The candidates so far that would become finalists, most accurate first."""
+        records = session.run.trials_of(name)
+        cost = {record.id: record.config["flops_per_particle"] for record in records}
+        return choose_finalists(records, cost, self.count, session.study.selection.accurate_enough)
+
+    def _screening_samples(self, problem: Problem) -> tuple[list[Sample], list[Sample]]:
+        train, valid = (
+            [split[place] for place in evenly_spaced(len(split), self.screening_frames)]
+            for split in (problem.train_samples, problem.valid_samples)
+        )
+        return train, valid
 
 
 def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range: int) -> list[dict[str, Value]]:
@@ -82,33 +133,6 @@ def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list
     return [layers[owner] | choices[owner][place - ends[owner]] for place, owner in owners]
 
 
-def screen_closed_forms(session: Session, stage: str) -> dict:
-    """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
-
-    Half of them are drawn from all layers that the space holds, as many of each architecture; the others are proposed
-    from the records of those before.
-    """
-    settings, problem = session.study.stages[stage], session.problem
-    layers = single_layers(session.space, session.study.network, settings.values_per_range)
-    samples = tuple(
-        [split[place] for place in evenly_spaced(len(split), settings.screening_frames)]
-        for split in (problem.train_samples, problem.valid_samples)
-    )
-    untried = {layer_id(layer): layer for layer in layers}
-    batch = _draw(layers, (settings.max_candidates + 1) // 2, session.seed_of(stage))
-    number = 0
-    while batch and number < settings.max_candidates:
-        for layer in batch:
-            del untried[layer_id(layer)]
-        affordable = [layer for layer in batch if session.affordable(layer)][: settings.max_candidates - number]
-        for layer in session.progress(affordable, "closed forms"):
-            folder = session.run.trial(trial_name(stage, number))
-            _fit_and_record(session, layer, samples, folder, stage, session.study.seeds.init, settings.ridge)
-            number += 1
-        batch = propose(_winners(session, stage), list(untried.values()))
-    return {}
-
-
 def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]]) -> list[dict[str, Value]]:
     """The layers to fit next, given those that would become finalists now; none where nothing near them is left.
 
@@ -136,14 +160,6 @@ def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -
     return [other for other in others if sum(layer[name] != other[name] for name in layer if name in other) == 1]
 
 
-def _winners(session: Session, stage: str) -> list[TrialRecord]:
-    """The candidates that would become finalists, most accurate first."""
-    records = session.run.trials_of(stage)
-    cost = {record.id: record.config["flops_per_particle"] for record in records}
-    count = session.study.stages[stage].count
-    return choose_finalists(records, cost, count, session.study.selection.accurate_enough)
-
-
 def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[str, dict[str, Value]]:
     """Fit the best candidates to the whole training split, without the branches and features that they do not need.
 
@@ -159,17 +175,23 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
     """
     study, chosen = session.study, {}
     for name in reads_of(study.stages, stage):
-        if study.stages[name].kind == STAGE:
-            for record in session.progress(_winners(session, name), "closed-form finalists"):
-                finalist, parameters = _lean(session, record, seed, study.stages[name].ridge)
+        settings = study.stages[name]
+        if isinstance(settings, ClosedFormStage):
+            for record in session.progress(settings.winners(session, name), "closed-form finalists"):
+                finalist, parameters = without_unneeded_features(session, record, seed, settings.ridge)
                 chosen.setdefault(layer_id(parameters), (finalist, parameters))
     return dict(chosen.values())
 
 
-def _lean(session: Session, candidate: TrialRecord, seed: int, ridge: float) -> tuple[str, dict[str, Value]]:
-    """Drop each optional feature whose loss the validation error does not show; id and hyperparameters that remain.
+def without_unneeded_features(
+    session: Session, candidate: TrialRecord, seed: int, ridge: float
+) -> tuple[str, dict[str, Value]]:
+    """Drop each optional feature that the validation error of a candidate does not need.
 
     A feature goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
+
+    Returns:
+        The id of what remains, which names the dropped features, and its hyperparameters.
     """
 
     def fitted(finalist: str, parameters: Mapping[str, Value]) -> float:

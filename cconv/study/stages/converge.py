@@ -6,42 +6,75 @@ afresh, as a learning rate that fades with the budget cannot be continued.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
 
-from cconv.study.declared.stage_tables import reads_of
+from cconv.study.declared.stage import Stage, reads_of
 from cconv.study.evidence.budget import still_falling
 from cconv.study.stages.finalists import Finalist, finalist_jobs, finalist_training, retrained_finalists
-from cconv.study.stages.search import train_all
+from cconv.study.stages.jobs import train_all
 from cconv.study.stages.session import Session
+from cconv.validation import Name, Whole
 
 
-def train_longer(session: Session, stage: str) -> dict:
-    """Train the finalists that the stage names with its budgets, one after another.
+class ConvergeStage(Stage):
+    """Train finalists with each of `budgets` (gradient updates, ascending) until more no longer lowers the error.
 
-    Returns:
-        "finalists", the hyperparameters of the longest training of each model, by an id that ends in its updates; and
-        "convergence", by model: "points", an entry a budget ("id", "updates", "valid_normalized_mse", mean over the
-        seeds, "by_seed", "train_seconds"), and "still_falling", whether the last budget still lowered the error.
+    `of` names the baseline or configurations that a stage of finalists includes; None means every trained finalist.
     """
-    study, settings = session.study, session.study.stages[stage]
-    own = finalist_training(study)
-    models = _named(_trained_finalists(session, stage), settings.of)
-    points = {name: [point] for name in models if (point := _point(session, name, own.updates))}
-    going = list(points)
-    for updates in settings.budgets:
-        training = own.model_copy(update={"updates": updates})
-        longer = [Finalist(id=f"{name}_after_{updates}", parameters=models[name]) for name in going]
-        jobs = finalist_jobs(longer, study.finalists.seeds, study.seeds.init + 1, session.run)
-        train_all(session, stage, jobs, training)
-        ends = {name: _point(session, f"{name}_after_{updates}", updates) for name in going}
-        for name in going:
-            points[name] += [ends[name]] if ends[name] else []
-        going = [name for name in going if ends[name] and still_falling(points[name], study.selection.margin)]
-    return {
-        "finalists": {each[-1]["id"]: models[name] for name, each in points.items() if len(each) > 1},
-        "convergence": {name: {"points": each, "still_falling": name in going} for name, each in points.items()},
-    }
+
+    kind: Literal["converge"] = "converge"
+    uses = ("finalists",)
+    needs_records = True
+    budgets: tuple[Annotated[Whole, Field(ge=1, le=10_000_000)], ...] = Field(min_length=1, max_length=20)
+    of: tuple[Name, ...] | None = None
+
+    @field_validator("budgets")
+    @classmethod
+    def _budgets_ascend(cls, budgets: tuple[int, ...]) -> tuple[int, ...]:
+        if list(budgets) != sorted(set(budgets)):
+            raise ValueError("budgets must ascend")
+        return budgets
+
+    @property
+    def named_finalists(self) -> tuple[str, ...]:
+        """Ids of the finalists that the stage asks for."""
+        return self.of or ()
+
+    def run(self, session: Session, name: str) -> dict:
+        """Train the finalists that the stage names with its budgets, one after another.
+
+        Returns:
+            "finalists", the hyperparameters of the longest training of each model, by an id that ends in its updates;
+            and "convergence", by model: "points", an entry a budget ("id", "updates", "valid_normalized_mse", mean over
+            the seeds, "by_seed", "train_seconds"), and "still_falling", whether the last budget still lowered the
+            error.
+        """
+        own = finalist_training(session.study).updates
+        models = _named(_trained_finalists(session, name), self.of)
+        points = {model: [point] for model in models if (point := _point(session, model, own))}
+        going = list(points)
+        for updates in self.budgets:
+            ends = _train_with(session, name, {model: models[model] for model in going}, updates)
+            for model, end in ends.items():
+                points[model].append(end)
+            going = [model for model in ends if still_falling(points[model], session.study.selection.margin)]
+        return {
+            "finalists": {each[-1]["id"]: models[model] for model, each in points.items() if len(each) > 1},
+            "convergence": {model: {"points": each, "still_falling": model in going} for model, each in points.items()},
+        }
+
+
+def _train_with(session: Session, stage: str, models: Mapping[str, dict], updates: int) -> dict[str, dict]:
+    """Train models with a budget; returns the point of each whose trainings all finished."""
+    study = session.study
+    training = study.training.model_copy(update={"updates": updates})
+    longer = [Finalist(id=f"{model}_after_{updates}", parameters=parameters) for model, parameters in models.items()]
+    train_all(session, stage, finalist_jobs(longer, study.finalists.seeds, study.seeds.init + 1, session.run), training)
+    points = {model: _point(session, f"{model}_after_{updates}", updates) for model in models}
+    return {model: point for model, point in points.items() if point}
 
 
 def _trained_finalists(session: Session, stage: str) -> dict[str, dict]:

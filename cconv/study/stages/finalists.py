@@ -4,8 +4,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
@@ -14,7 +16,7 @@ from cconv.evaluation.statistics import crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.errors import frame_errors, normalized_mse
 from cconv.study.declared.configuration import TrainingConfig
-from cconv.study.declared.stage_tables import BASELINE
+from cconv.study.declared.stage import BASELINE, Stage
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.evidence.budget import fall_at_the_end
 from cconv.study.evidence.recommendation import choose_finalists
@@ -22,9 +24,10 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.trial_queue import Job, job_in
 from cconv.study.stages.closed_form import fit_closed_form_finalists
-from cconv.study.stages.search import train_all
+from cconv.study.stages.jobs import train_all
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
+from cconv.validation import Name, Value, Whole
 
 FINALISTS = "finalists"
 
@@ -67,26 +70,50 @@ class Retrained:
         return self.checkpoints[int(np.argmin(self.valid_errors))]
 
 
-def retrain_finalists(session: Session, stage: str) -> dict:
-    """Retrain the baseline, named configurations and the best of the searches with fresh seeds; fit the closed forms.
+class FinalistsStage(Stage):
+    """Retrain the `count` best configurations and the baseline with fresh seeds; fit the best closed forms.
 
-    Returns:
-        "finalists": the hyperparameters of each, by id.
-
-    Raises:
-        StudyError: If none of them finished its training.
+    `include` names further configurations, e.g. a published one, by the id that they get.
     """
-    study, settings = session.study, session.study.stages[stage]
-    first_seed = study.seeds.init + 1
-    closed = fit_closed_form_finalists(session, stage, first_seed)
-    named = {BASELINE: session.space.baseline, **settings.include}
-    searched = {record.id: record.parameters for record in best_trials(session, stage)}
-    trained = [Finalist(id=name, parameters=parameters) for name, parameters in (named | searched).items()]
-    jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
-    train_all(session, FINALISTS, jobs, finalist_training(study))
-    finalists = named | searched | closed
-    check_any_finished(session.run, *retrained_finalists(session.run, finalists, study.finalists.seeds))
-    return {"finalists": finalists}
+
+    kind: Literal["finalists"] = "finalists"
+    uses = ("closed_form", "random", "adaptive")
+    needs_records = True
+    count: Whole = Field(3, ge=1, le=1000)
+    include: dict[Name, dict[str, Value]] = Field({}, max_length=100)
+
+    @property
+    def included(self) -> Mapping[str, dict[str, Value]]:
+        """Hyperparameters of the configurations that the stage makes finalists, by the id that they get."""
+        return self.include
+
+    def run(self, session: Session, name: str) -> dict:
+        """Retrain the baseline, named configurations and the best of the searches; fit the closed forms.
+
+        Returns:
+            "finalists": the hyperparameters of each, by id.
+
+        Raises:
+            StudyError: If none of them finished its training.
+        """
+        study = session.study
+        first_seed = study.seeds.init + 1
+        closed = fit_closed_form_finalists(session, name, first_seed)
+        named = {BASELINE: session.space.baseline, **self.include}
+        searched = {record.id: record.parameters for record in self._best_trials(session, name)}
+        trained = [Finalist(id=finalist, parameters=parameters) for finalist, parameters in (named | searched).items()]
+        jobs = finalist_jobs(trained, study.finalists.seeds, first_seed, session.run)
+        train_all(session, FINALISTS, jobs, finalist_training(study))
+        finalists = named | searched | closed
+        check_any_finished(session.run, *retrained_finalists(session.run, finalists, study.finalists.seeds))
+        return {"finalists": finalists}
+
+    def _best_trials(self, session: Session, name: str) -> list[TrialRecord]:
+        """The best trained configurations of the searches that the stage reads, the baseline's own left out."""
+        records = session.read(name, "random", "adaptive")
+        others = [record for record in records if record.parameters != session.space.baseline]
+        cost = {record.id: record.config["flops_per_particle"] for record in others}
+        return choose_finalists(others, cost, self.count, session.study.selection.accurate_enough)
 
 
 def check_any_finished(run: RunFolder, finished: Sequence[Retrained], failed: Mapping[str, str]) -> None:
@@ -94,15 +121,6 @@ def check_any_finished(run: RunFolder, finished: Sequence[Retrained], failed: Ma
     if not finished:
         ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
         raise StudyError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
-
-
-def best_trials(session: Session, stage: str) -> list[TrialRecord]:
-    """The best trained configurations of the searches that a stage reads, the baseline's own left out."""
-    records = session.read(stage, "random", "adaptive")
-    others = [record for record in records if record.parameters != session.space.baseline]
-    cost = {record.id: record.config["flops_per_particle"] for record in others}
-    count, enough = session.study.stages[stage].count, session.study.selection.accurate_enough
-    return choose_finalists(others, cost, count, enough)
 
 
 def finalist_training(study: StudyConfig) -> TrainingConfig:

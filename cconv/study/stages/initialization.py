@@ -1,39 +1,57 @@
-"""The initialisation stage (thesis, 4.1): the luck of initial weights beside the choice of a configuration.
+"""The initialisation stage (thesis, 4.1), a study of the variance over seeds beside that over configurations.
 
 The baseline is trained with many seeds, and many random configurations with one seed; nothing is stopped. So the same
-trainings tell at every rung how much of the spread is luck, and how well a rung foretells the full budget.
+trainings tell at every rung how much of the spread comes from the seed, and how well a rung predicts the full budget.
 """
 
+from typing import Literal
+
+from pydantic import Field
+
+from cconv.study.declared.stage import MOST_TRIALS, Stage
 from cconv.study.evidence.rung_audit import audit_rungs
 from cconv.study.evidence.seed_variance import variance_decomposition
 from cconv.study.evidence.strategies import compare_strategies, learning_curves
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.sampling import random_parameters
-from cconv.study.stages.search import train_all, trial_job
+from cconv.study.running.trial_queue import Job
+from cconv.study.stages.jobs import train_all, trial_job
 from cconv.study.stages.session import Session
+from cconv.validation import Whole
 
 
-def train_unstopped(session: Session, stage: str) -> dict:
-    """Train the baseline with many seeds and many configurations with one; compare their spreads, audit the rungs."""
-    study, settings = session.study, session.study.stages[stage]
-    first = study.seeds.init + 1 + study.finalists.seeds  # seeds that no other stage uses
-    draws = [
-        random_parameters(session.space, session.seed_of(stage), number, session.affordable)
-        for number in range(settings.configurations)
-    ]
-    trainings = [(session.space.baseline, first + number) for number in range(settings.seeds)]
-    trainings += [(parameters, study.seeds.init) for parameters in draws]
-    jobs = [trial_job(session, stage, number, *training) for number, training in enumerate(trainings)]
-    train_all(session, stage, jobs, study.training)
-    seeds, configurations = by_purpose(session.run, stage, study.seeds.init)
-    completed = [record for record in configurations if record.outcome == "completed"]
-    seed, factor = session.seed_of(stage), study.search.reduction_factor
-    return {
-        "initialization": variance_decomposition(seeds, configurations, study.rungs),
-        "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor),
-        "strategies": compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
-    }
+class InitializationStage(Stage):
+    """Train the baseline with `seeds` initial weights, and `configurations` of the space with one; stop nothing.
+
+    The trainings tell the variance over initial weights from that over configurations, and audit the rungs.
+    """
+
+    kind: Literal["initialization"] = "initialization"
+    seeds: Whole = Field(5, ge=2, le=1000)
+    configurations: Whole = Field(16, ge=2, le=MOST_TRIALS)
+
+    def run(self, session: Session, name: str) -> dict:
+        """Train them; returns "initialization", the two variances; "rung_audit" and "strategies", from the curves."""
+        study, seed = session.study, session.seed_of(name)
+        train_all(session, name, self._jobs(session, name), study.training)
+        seeds, configurations = by_purpose(session.run, name, study.seeds.init)
+        completed = [record for record in configurations if record.outcome == "completed"]
+        factor = study.search.reduction_factor
+        return {
+            "initialization": variance_decomposition(seeds, configurations, study.rungs),
+            "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor),
+            "strategies": compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
+        }
+
+    def _jobs(self, session: Session, name: str) -> list[Job]:
+        study, space = session.study, session.space
+        first = study.seeds.init + 1 + study.finalists.seeds  # seeds that no other stage uses
+        trainings = [(space.baseline, first + number) for number in range(self.seeds)]
+        for number in range(self.configurations):
+            drawn = random_parameters(space, session.seed_of(name), number, session.affordable)
+            trainings.append((drawn, study.seeds.init))
+        return [trial_job(session, name, number, *training) for number, training in enumerate(trainings)]
 
 
 def by_purpose(run: RunFolder, stage: str, search_seed: int) -> tuple[list[TrialRecord], list[TrialRecord]]:

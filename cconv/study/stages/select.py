@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.models.checkpoint import load_model
 from cconv.models.errors import mean_predictor_error, normalized_mse
-from cconv.study.declared.stage_tables import BASELINE, reads_of
+from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.budget import budget_words
 from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
 from cconv.study.evidence.recommendation import Recommendation, recommend, retrained_error
@@ -40,13 +41,30 @@ TIMED_FRAMES = 5
 GROWTH_REPEATS = 3
 
 
-def select(session: Session, stage: str) -> dict:
-    """Choose a finalist by validation errors, time and stability; then read the test split, once; write summary.json.
+class SelectStage(Stage):
+    """Test, time and stress the finalists and recommend one."""
 
-    Raises:
-        StudyError: If no finalist could be retrained.
-    """
-    start = time.perf_counter()
+    kind: Literal["select"] = "select"
+    uses = ("finalists", "converge")
+    needs_records = True
+
+    def run(self, session: Session, name: str) -> dict:
+        """Choose a finalist by validation errors, time and stability; then read the test split, once.
+
+        Writes summary.json; returns "recommended", the id of the finalist.
+
+        Raises:
+            StudyError: If no finalist could be retrained.
+        """
+        start = time.perf_counter()
+        summary = _summary(session, name)
+        seconds = _seconds_before(session, name) + time.perf_counter() - start
+        session.run.write("summary.json", summary | {"wall_seconds": seconds})
+        return {"recommended": summary["recommended"]["id"]}
+
+
+def _summary(session: Session, stage: str) -> dict:
+    """Judge, test and explain the finalists; returns all of summary.json but the time that the study took."""
     study, run = session.study, session.run
     finalists, failed = _finalists(session, stage)
     check_any_finished(run, finalists, failed)
@@ -60,7 +78,7 @@ def select(session: Session, stage: str) -> dict:
         complete_cards(finalist, tests[finalist.id], environment)
     trivial, found = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
     entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
-    summary = {
+    return {
         "study": study.name,
         "task": study.task.name,
         "dataset": _dataset(session, samples),
@@ -79,10 +97,7 @@ def select(session: Session, stage: str) -> dict:
         "trials": _counts(run),
         "rungs": _passed_rungs(session),
         **found,
-        "wall_seconds": _seconds_before(session, stage) + time.perf_counter() - start,
     }
-    run.write("summary.json", summary)
-    return {"recommended": judged.chosen.id}
 
 
 @dataclass(frozen=True, kw_only=True)

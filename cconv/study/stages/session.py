@@ -10,7 +10,7 @@ from cconv.data.dataset import Dataset
 from cconv.errors import ConfigError
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
-from cconv.study.declared.stage_tables import reads_of
+from cconv.study.declared.stage import reads_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.trials import TrialRecord
@@ -63,7 +63,7 @@ class Session:
 
     def space_of(self, stage: str) -> SearchSpace:
         """The study's space, or the one that an earlier stage refined for this one."""
-        refined = self.study.stages[stage].space
+        refined = self.study.stages[stage].space_from
         return self.space if refined is None else load_space(self.run.path / "stages" / f"{refined}.toml")
 
     def affordable(self, parameters: Mapping) -> bool:

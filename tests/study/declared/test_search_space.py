@@ -9,8 +9,8 @@ from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
 from cconv.study.declared.search_space import check_baseline_affordable, load_space
-from cconv.study.declared.study_file import load_study
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
+from cconv.study.studies import load_study
 
 REPOSITORY = Path(__file__).parents[3]
 SPACES = sorted((REPOSITORY / "search_spaces").glob("*.toml"))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cconv.errors import ConfigError
-from cconv.study.declared.study_file import load_study
+from cconv.study.studies import load_study
 
 REPOSITORY = Path(__file__).parents[3]
 STUDIES = sorted((REPOSITORY / "experiments").glob("*.toml"))

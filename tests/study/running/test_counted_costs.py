@@ -5,11 +5,11 @@ import pytest
 from systems import configured, problem
 
 from cconv.evaluation.cost import Cost, flops_per_particle
-from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.counted_costs import CostCounter, points_of_search
+from cconv.study.studies import Study
 
-STUDY = StudyConfig.model_validate({"name": "s", "task": "density_rate", "search": {"space": "s.toml"}})
+STUDY = Study.model_validate({"name": "s", "task": "density_rate", "search": {"space": "s.toml"}})
 PARAMETERS = [
     {"layers": layers, "first_channels": width, "hidden_channels": width, "relative_cutoff": cutoff}
     for layers in (1, 2, 3)

@@ -14,9 +14,9 @@ from conftest import SMOKE
 from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
-from cconv.study.declared.study_file import load_study
 from cconv.study.running.private_ray import PREFIX, check_token_of_cluster, private_folder, remove_private_folders
 from cconv.study.running.ray_pool import ray_pool
+from cconv.study.studies import load_study
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
 NOBODY = 65534

@@ -16,11 +16,11 @@ from conftest import SMOKE
 from processes import PATIENCE
 
 from cconv.errors import ConfigError
-from cconv.study.declared.study_file import load_study
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
 from cconv.study.running.ray_pool import STARTS, RayPool, _start, ray_pool
 from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
+from cconv.study.studies import load_study
 
 FULL = 2
 ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers know no tests

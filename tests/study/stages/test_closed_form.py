@@ -7,12 +7,19 @@ import pytest
 
 from cconv import load_model, open_dataset
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.study.declared.configuration import DEFAULTS
+from cconv.study.declared.configuration import DEFAULTS, OPTIONAL_FEATURES
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.stages import closed_form
-from cconv.study.stages.closed_form import BRANCHES, STAGE, _draw, _lean, _neighbors, layer_id, propose, single_layers
+from cconv.study.stages.closed_form import (
+    _draw,
+    _neighbors,
+    layer_id,
+    propose,
+    single_layers,
+    without_unneeded_features,
+)
 from cconv.tasks.samples import iterate_samples
 
 
@@ -118,7 +125,7 @@ def run(finished_run):
 
 
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
-    screened = [record for record in run.trials() if record.stage == STAGE]
+    screened = [record for record in run.trials() if record.stage == "closed_form"]
     best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
     entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
     (record,) = run.retrainings()[entry["id"]]
@@ -145,7 +152,7 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
 def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept, tmp_path, monkeypatch):
     def fit(session, parameters, folder, stage, seed, ridge):
         folder.start({"stage": stage, "parameters": parameters})
-        error = errors[" ".join(branch for branch in BRANCHES if parameters[branch])]
+        error = errors[" ".join(branch for branch in OPTIONAL_FEATURES if parameters[branch])]
         folder.append({"updates": 0, "valid_normalized_mse": error, "seconds": 1.0})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
@@ -153,9 +160,9 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
     study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True, "density": True})
-    finalist, parameters = _lean(session, candidate, seed=1, ridge=0.0)
-    assert " ".join(branch for branch in BRANCHES if parameters[branch]) == kept
-    assert finalist == "found" + "".join(f"_no_{branch}" for branch in BRANCHES if not parameters[branch])
+    finalist, parameters = without_unneeded_features(session, candidate, seed=1, ridge=0.0)
+    assert " ".join(branch for branch in OPTIONAL_FEATURES if parameters[branch]) == kept
+    assert finalist == "found" + "".join(f"_no_{branch}" for branch in OPTIONAL_FEATURES if not parameters[branch])
     assert session.run.finalist(finalist, 1).parameters == parameters
 
 
@@ -169,13 +176,13 @@ def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkey
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(boundary=[True]))
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True})
-    assert _lean(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
+    assert without_unneeded_features(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
     assert fitted == [candidate.parameters]
 
 
 def test_candidates_go_on_from_the_would_be_finalists(run):
     """Of four candidates the last two are one change away from the best of those before them."""
-    records = run.trials_of(STAGE)
+    records = run.trials_of("closed_form")
     best = min(records[:2], key=lambda record: record.best)
     for record in records[2:]:
         parents = [best, *records[2:]]

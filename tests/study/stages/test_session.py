@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import SMOKE
 
-from cconv.study.declared.study_file import load_study
 from cconv.study.stages.session import Session
+from cconv.study.studies import load_study
 
 
 def session_of(*settings):

@@ -3,15 +3,15 @@
 import pytest
 
 from cconv.errors import ConfigError
-from cconv.study.declared.stage_tables import default_stages, readers_of, reads_of
-from cconv.study.declared.study_file import StudyConfig
+from cconv.study.declared.stage import readers_of, reads_of
+from cconv.study.studies import Study
 from cconv.validation import validated
 
 SEARCH = {"space": "space.toml"}
 
 
 def study(**stages):
-    return validated(StudyConfig, {"name": "s", "task": "density_rate", "search": SEARCH, "stages": stages}, "s.toml")
+    return validated(Study, {"name": "s", "task": "density_rate", "search": SEARCH, "stages": stages}, "s.toml")
 
 
 def test_a_stage_has_the_kind_of_its_name_unless_it_says_otherwise():
@@ -33,10 +33,6 @@ def test_more_trials_reach_every_stage_that_reads_them_directly_or_not():
     stages = study(closed_form={}, random={}, refine={}, adaptive={"space": "refine"}, finalists={}, select={}).stages
     assert readers_of(stages, "random") == {"refine", "adaptive", "finalists", "select"}
     assert readers_of(stages, "adaptive") == {"finalists", "select"}
-
-
-def test_the_default_stages_read_earlier_ones():
-    assert study(**{name: stage.model_dump() for name, stage in default_stages().items()}).stages == default_stages()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from cconv.errors import ConfigError
 from cconv.study.declared.study_file import SeedsConfig
 from cconv.study.records.run_folder import RunFolder
-from cconv.study.stages.search import trial_job
+from cconv.study.stages.jobs import trial_job
 
 
 @pytest.fixture

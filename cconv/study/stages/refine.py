@@ -1,0 +1,23 @@
+"""The refine stage (thesis, 4.3.1): a narrower search space, by what earlier trials showed."""
+
+from typing import Literal
+
+from cconv.study.declared.stage import Stage
+from cconv.study.evidence.narrowed_space import refine, write_space
+from cconv.study.stages.session import Session
+
+
+class RefineStage(Stage):
+    """Narrow the space from the records that are read, with a reason for each parameter."""
+
+    kind: Literal["refine"] = "refine"
+    uses = ("baseline", "initialization", "random")
+    needs_records = True
+
+    def run(self, session: Session, name: str) -> dict:
+        """Write the narrowed space to ``stages/<name>.toml``; returns "refined", the reason for each parameter."""
+        space, reasons = refine(session.space, session.read(name), session.study.training.updates)
+        path = session.run.path / "stages" / f"{name}.toml"
+        path.parent.mkdir(exist_ok=True)
+        write_space(space, path)
+        return {"refined": reasons}
