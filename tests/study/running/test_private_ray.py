@@ -4,7 +4,6 @@ import os
 import stat
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import psutil
@@ -15,7 +14,7 @@ from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
 from cconv.study.declared.study_file import load_study
-from cconv.study.running.private_ray import PREFIX, check_token_of_cluster, private_folder, remove_private_folders
+from cconv.study.running.private_ray import check_token_of_cluster
 from cconv.study.running.ray_pool import ray_pool
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
@@ -150,51 +149,3 @@ def test_a_token_in_the_environment_needs_no_file(token_file, monkeypatch):
     token_file.chmod(0o644)
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
     check_token_of_cluster("there:1")
-
-
-def test_folders_of_killed_runs_go_and_those_in_use_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 1000)
-    left = tmp_path / f"{PREFIX}abcdefgh"
-    left.mkdir()
-    other = tmp_path / f"{PREFIX}is_a_file"[: len(left.name)]
-    other.touch()
-    with private_folder() as first:
-        remove_private_folders()
-        assert (left.exists(), other.exists(), first.is_dir()) == (False, True, True)
-        with private_folder() as second:
-            assert first != second
-        assert not second.exists()
-    assert not first.exists()
-
-
-def test_a_folder_that_another_run_deletes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 1000)
-    make, made = tempfile.mkdtemp, []
-
-    def deleted_the_first_time(**where):
-        made.append(make(**where))
-        if len(made) == 1:
-            remove_private_folders()
-        return made[-1]
-
-    monkeypatch.setattr(tempfile, "mkdtemp", deleted_the_first_time)
-    with private_folder() as folder:
-        assert [str(folder)] == made[1:]
-        assert folder.is_dir()
-
-
-def test_a_long_place_for_temporary_files_is_passed_over(tmp_path, monkeypatch):
-    long = tmp_path / ("x" * 100)
-    long.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(long))
-    with private_folder() as folder:
-        assert long not in folder.parents
-
-
-def test_no_place_for_temporary_files_is_one_line_that_names_the_variable(monkeypatch):
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 20)
-    with pytest.raises(ConfigError, match="bytes too long.*set TMPDIR") as caught, private_folder():
-        pass
-    assert "\n" not in str(caught.value)
