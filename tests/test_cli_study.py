@@ -179,6 +179,7 @@ def interrupt(command, ready, timeout=PATIENCE):
     return process.returncode, error.decode()
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     folder = tmp_path / "run"
     long = ["--set", "training.updates=100000", "--set", "search.grace_updates=60"]
@@ -198,6 +199,7 @@ def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     assert load_model(next(folder.glob("trials/*/checkpoint"))).num_parameters > 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_usable_checkpoint_of_a_training(flow_folder, tmp_path):
     folder = tmp_path / "one"
     command = [SCRIPT, "train", SMOKE, "--data", flow_folder, "--out", folder, "--set", "training.updates=1000000"]

@@ -9,6 +9,8 @@ import pytest
 MODULE = """
 from cconv.compiled import compile_cached
 
+pytestmark = pytest.mark.integration
+
 @compile_cached(error_model="numpy")
 def double(value):
     return 2 * value

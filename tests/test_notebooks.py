@@ -46,6 +46,7 @@ def whole_run(tmp_path):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_shows_charts_and_tables(path, monkeypatch):

@@ -60,6 +60,7 @@ def test_every_scene_becomes_a_data_set(name, tmp_path):
     )
 
 
+@pytest.mark.integration
 def test_same_seed_gives_the_same_bytes_whatever_the_workers_and_another_seed_others(tmp_path):
     made(tmp_path / "a", seed=1)
     made(tmp_path / "b", seed=1, workers=2)
@@ -176,6 +177,7 @@ def test_unfinished_trajectories_of_other_settings_are_not_mixed_in(tmp_path, mo
     assert (tmp_path / "a" / "train.h5").read_bytes() == (tmp_path / "b" / "train.h5").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     """`kill -9` of the whole process group; the command that is given again redoes no finished trajectory."""
     command = [
@@ -268,6 +270,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, monkeypatch):
         made(tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_parent_and_at_an_interrupt(tmp_path):
     """Even within a relaxation that would take minutes."""
     command = [

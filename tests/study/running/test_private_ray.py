@@ -53,6 +53,7 @@ def join(address, *arguments, user=None, **environment):
     return run.stdout
 
 
+@pytest.mark.slow
 def test_everything_listens_on_loopback_alone(running):
     processes = tree(os.getpid())
     listeners = {
@@ -65,6 +66,7 @@ def test_everything_listens_on_loopback_alone(running):
     assert {ip for _, ip in listeners} <= set(LOOPBACK)
 
 
+@pytest.mark.slow
 def test_only_the_owner_reads_the_token_and_no_command_line_or_environment_holds_it(running):
     _, path = running
     token = path.read_text()
@@ -76,6 +78,7 @@ def test_only_the_owner_reads_the_token_and_no_command_line_or_environment_holds
         assert token not in process.environ().values()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
     [{"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}],
@@ -85,12 +88,14 @@ def test_who_has_no_token_or_a_wrong_one_cannot_join(running, environment):
     assert join(running[0], **environment).startswith("refused AuthenticationError")
 
 
+@pytest.mark.slow
 def test_who_has_the_token_can_join(running):
     """Otherwise the tests beside this one would pass for another reason than the token."""
     address, path = running
     assert join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN_PATH=str(path)) == "joined\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
 def test_another_user_can_neither_read_the_token_nor_join(running):
     address, path = running

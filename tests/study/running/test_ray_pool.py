@@ -16,6 +16,8 @@ from cconv.study.records.trials import TrialFolder
 from cconv.study.running.ray_pool import STARTS, RayPool, _start, ray_pool
 from cconv.study.running.trial_queue import NothingStops, TrialQueue
 
+pytestmark = pytest.mark.integration
+
 ray.cloudpickle.register_pickle_by_value(troubles)  # workers know no tests
 
 
@@ -52,6 +54,7 @@ def test_one_that_fails_is_recorded_with_its_reason_and_others_go_to_the_full_bu
         assert {path.name for path in folder.iterdir()} == {"config.json", "log.jsonl", "outcome.json", "checkpoint"}
 
 
+@pytest.mark.slow
 def test_one_whose_process_dies_is_given_up_and_one_that_hangs_is_ended_at_its_limit(train, tmp_path):
     ends = train([3, 4, 0], "search.trial_seconds=15")
     assert ends[0] == ("completed", "")
@@ -62,6 +65,7 @@ def test_one_whose_process_dies_is_given_up_and_one_that_hangs_is_ended_at_its_l
     assert "in hang" in (tmp_path / "trial_4" / "hanging.txt").read_text()
 
 
+@pytest.mark.slow
 def test_one_that_takes_too_long_is_stopped_and_the_record_names_the_limit(train):
     endless = [f"{key}=1000000" for key in ("training.updates", "training.evaluate_every", "search.grace_updates")]
     reason = "it trained longer than its limit of 10 seconds"
