@@ -162,6 +162,16 @@ def test_a_checkpoint_of_another_task_is_refused(cconv, finished_run):
     assert_one_clear_line(outcome, "density_gradient", "density_rate")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [("run", SMOKE, "--data", "flow"), ("resume", "run"), ("extend", "run", "--stage", "random", "--trials", "1")],
+    ids=lambda command: command[0],
+)
+def test_a_serial_study_is_on_no_cluster(cconv, command):
+    outcome = cconv("study", *command, "--serial", "--address", "127.0.0.1:6379")
+    assert_one_clear_line(outcome, "--serial", "--address", "give one of them")
+
+
 def test_what_is_no_run_or_checkpoint_is_named(cconv, tmp_path):
     assert_one_clear_line(cconv("study", "status", tmp_path), "study.json")
     assert_one_clear_line(cconv("report", tmp_path), "study.json")

@@ -37,7 +37,7 @@ def code_cells(path):
 
 @pytest.fixture
 def whole_run(tmp_path):
-    """The committed run with everything that can be recorded."""
+    """A copy of the committed run with everything that can be recorded."""
     run = RunFolder(shutil.copytree(ANALYSIS / "sample_run", tmp_path / "run"))
     run.write("summary.json", whole_summary(run.read("summary.json")))
     (run.path / "explanation").mkdir(exist_ok=True)
