@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 MODULE = """
 from cconv.compiled import compile_cached
-
-pytestmark = pytest.mark.integration
 
 @compile_cached(error_model="numpy")
 def double(value):

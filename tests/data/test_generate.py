@@ -20,6 +20,8 @@ from cconv.data.simulate import simulate
 from cconv.errors import ConfigError, DataError, SimulationError
 from cconv.scenes import SCENES, scene_named
 
+pytestmark = pytest.mark.integration
+
 FILES = ("train.h5", "valid.h5", "test.h5", "metadata.json")
 LAGRANGEBENCH_KEYS = {
     "case", "solver", "density_evolution", "dim", "dx", "dt", "t_end", "viscosity", "p_bg_factor", "g_ext_magnitude",
@@ -60,7 +62,6 @@ def test_every_scene_becomes_a_data_set(name, tmp_path):
     )
 
 
-@pytest.mark.integration
 def test_same_seed_gives_the_same_bytes_whatever_the_workers_and_another_seed_others(tmp_path):
     made(tmp_path / "a", seed=1)
     made(tmp_path / "b", seed=1, workers=2)

@@ -27,6 +27,8 @@ from cconv.models.model import NetworkConfig, build_field_model
 from cconv.neighbors import radius_graph
 from cconv.sph import CubicSpline
 
+pytestmark = pytest.mark.integration
+
 NETWORK = NetworkConfig(layers=1, basis="radial", message="difference", relative_cutoff=2.0)
 TASKS = ("density_rate", "density_gradient")
 SCENES = [

@@ -102,13 +102,14 @@ def test_finalists_were_retrained_with_seeds_that_the_search_did_not_use(run):
         assert search_seed not in seeds
 
 
-def test_the_checkpoint_gives_the_reported_test_error_again(run, summary, flow_folder):
+@pytest.mark.parametrize("split", ["valid", "test"])
+def test_the_checkpoint_gives_the_reported_errors_again(run, summary, flow_folder, split):
     dataset = open_dataset(flow_folder)
     for entry in summary["finalists"]:
         model = load_model(run.path / entry["checkpoint"], task=summary["task"])
-        errors = frame_errors(model, iterate_samples(dataset, "test", summary["task"], model.kernel))
+        errors = frame_errors(model, iterate_samples(dataset, split, summary["task"], model.kernel))
         seed = (run.path / entry["checkpoint"]).parent.name
-        assert normalized_mse(errors) == pytest.approx(entry["test"]["by_seed"][seed], rel=1e-6)
+        assert normalized_mse(errors) == pytest.approx(entry[split]["by_seed"][seed], rel=1e-6)
         assert model.num_parameters == entry["num_parameters"]
 
 
