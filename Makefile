@@ -1,22 +1,27 @@
 # make study   environment, data, the quick study, report
-# make test    environment, whole test suite
-# make test-slow   what takes hours: a thousand inputs, fifty kills
+# make test-fast   environment, the tests that start no processes: laws and formats, a minute or two
+# make test    environment, whole test suite, on all cores
+# make test-slow   what takes hours: clusters, kills, cold compilation, a thousand inputs
 # make check   environment, lint and format
 # make data    environment and the data of the quick study, made by the SPH solver
 
 PYTHON ?= python3.11
 VENV := .venv
 STUDY ?= experiments/quick.toml
+ON_ALL_CORES := -n logical --maxprocesses 8 --dist worksteal
 RUN ?= runs/$(basename $(notdir $(STUDY)))
 DATA := runs/data/dam_break_2d
 
-.PHONY: study test test-slow check data clean
+.PHONY: study test test-fast test-slow check data clean
 
 study: $(VENV)/.installed $(DATA)/metadata.json
 	$(VENV)/bin/cconv study run $(STUDY) --data $(DATA) --out $(RUN) --overwrite
 
 test: $(VENV)/.installed
-	$(VENV)/bin/pytest
+	$(VENV)/bin/pytest $(ON_ALL_CORES)
+
+test-fast: $(VENV)/.installed
+	$(VENV)/bin/pytest $(ON_ALL_CORES) -m "not slow and not integration"
 
 test-slow: $(VENV)/.installed
 	$(VENV)/bin/pytest -m slow

@@ -1,8 +1,12 @@
-"""Fixtures that all tests share."""
+"""Fixtures that all tests share, made once for all workers of pytest-xdist."""
 
+import fcntl
 import importlib.util
+import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +18,33 @@ from cconv.cli import main
 SCRIPT = Path(sys.executable).parent / "cconv"
 BENCHMARKS = Path(__file__).parents[1] / "experiments" / "benchmarks"
 SMOKE = Path(__file__).parents[1] / "experiments" / "smoke.toml"
+IS_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+WITHOUT_RAY = "import sys; sys.modules['ray'] = None; from cconv.cli import main; main()"
+
+if IS_WORKER:  # the workers themselves use the cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """What looks at a whole study is no fast test."""
+    for item in items:
+        if "finished_run" in item.fixturenames:
+            item.add_marker("integration")
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first of all workers to ask for it makes, while the others wait."""
+    base = factory.getbasetemp().parent if IS_WORKER else factory.getbasetemp()
+    folder, made = base / name, base / f"{name}.made"
+    with (base / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # what a worker that failed left
+            make(folder)
+            made.touch()
+    return folder
 
 
 @pytest.fixture
@@ -62,18 +93,22 @@ def flow_folder(tmp_path_factory):
     from cconv.data.generate import generate
     from cconv.scenes import scene_named
 
-    folder = tmp_path_factory.mktemp("data") / "flow"
-    scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=5, relaxation_steps=50)
-    generate(scene, folder, num_trajectories=4, num_frames=4, workers=1)
-    return folder
+    def make(folder):
+        scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=5, relaxation_steps=50)
+        generate(scene, folder, num_trajectories=4, num_frames=4, workers=1)
+
+    return made_once(tmp_path_factory, "flow", make)
 
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory, flow_folder):
-    """Run folder of a whole study of the smallest size, in a process of its own as Ray brings many more."""
-    folder = tmp_path_factory.mktemp("runs") / "smoke"
-    command = [SCRIPT, "study", "run", SMOKE, "--data", flow_folder, "--out", folder]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-    assert finished.returncode == 0, finished.stderr
-    assert f"Report: {folder / 'report.html'}" in finished.stdout
-    return folder
+    """Run folder of a whole serial study of the smallest size, in a process of its own that cannot import Ray."""
+
+    def make(folder):
+        study = ["study", "run", SMOKE, "--serial", "--data", flow_folder, "--out", folder]
+        command = [sys.executable, "-c", WITHOUT_RAY, *study]
+        finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        assert finished.returncode == 0, finished.stderr
+        assert f"Report: {folder / 'report.html'}" in finished.stdout
+
+    return made_once(tmp_path_factory, "smoke", make)

@@ -2,6 +2,12 @@
 
 from pathlib import Path
 
+from cconv.study.declared.search_space import load_space
+from cconv.study.pipeline import begin_study
+from cconv.study.records.run_folder import RunFolder
+from cconv.study.running.problem import with_data_path
+from cconv.study.studies import load_study
+
 SMOKE_SPACE = Path(__file__).parents[1] / "search_spaces" / "smoke.toml"
 
 SEARCH = """
@@ -36,3 +42,30 @@ def write_search(folder: Path, name: str, *, concurrency: int, random: int, adap
     settings = {"concurrency": concurrency, "random": random, "adaptive": adaptive}
     path.write_text(SEARCH.format(name=name, space=SMOKE_SPACE, **settings))
     return path
+
+
+def begin_search(study_file: Path, data: Path, folder: Path) -> RunFolder:
+    """A fresh run folder of a study file on given data."""
+    study = with_data_path(load_study(study_file), str(data))
+    run = RunFolder.create(folder, overwrite=False)
+    begin_study(study, load_space(study.search.space, study), run)
+    return run
+
+
+class Silent:
+    """An observer that does nothing with what it sees."""
+
+    def on_data(self, findings):
+        pass
+
+    def on_stage(self, stage, num_trials, max_updates):
+        pass
+
+    def on_trial_start(self, trial, parameters):
+        pass
+
+    def on_trial_result(self, trial, entry):
+        pass
+
+    def on_trial_end(self, trial, outcome, reason):
+        pass

@@ -1,47 +1,77 @@
-"""The benchmark script runs and writes what it says, on layers too small for its figures to mean anything."""
+"""The benchmark scripts run and write what they say, at sizes too small for their figures to mean anything."""
 
-import os
+import json
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
+from conftest import BENCHMARKS
+from particle_files import record_frames, write_parts
+from processes import PATIENCE
+
+from cconv.evaluation.cost import ANALYTIC
+
+
+def run(script, *arguments):
+    """What a script of experiments/benchmarks prints."""
+    command = [sys.executable, BENCHMARKS / f"{script}.py", "--smoke", *arguments]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_layers_measures_compares_and_draws(tmp_path):
+    printed = run("continuous_conv", "--out", tmp_path)
+    for what in ("the same: ours / matrix products", "geometry of 100,000 edges / layer", "extra memory"):
+        assert what in printed
+    sweeps = pd.read_csv(tmp_path / "sweeps.csv")
+    layers = sweeps[sweeps.sweep != "memory"]
+    assert set(layers.sweep) == {"num_particles", "neighbors", "kernel_size", "channels", "threads"}
+    assert {"ours", "general path", "matrix products"} <= set(layers.variant)
+    assert (layers[["low", "ms", "high"]] > 0).all().all()
+    assert layers.loc[layers.variant == "ours", "difference"].max() < 1e-5
+    targets = pd.read_csv(tmp_path / "targets.csv")
+    assert set(targets.quantity) == {"forward", "forward + backward", "preparation", "memory"}
+    assert (tmp_path / "sweeps.png").is_file()
 
 
 @pytest.fixture
-def benchmark(benchmark_script):
-    module = benchmark_script("continuous_conv")
-    threads = torch.get_num_threads()
-    yield module
-    torch.set_num_threads(threads)
+def dam_break(tmp_path):
+    """A folder of records as of the dam break of DPI-Net, of a block of 64 particles."""
+    ticks = 0.05 * np.arange(4, dtype="f4")
+    block = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+    for number in range(4):
+        frames = [frame | {"pos": block} for frame in record_frames(num_frames=21, num_particles=64)]
+        write_parts(tmp_path / "data", f"sim_{number:04d}", frames)
+    return tmp_path / "data"
 
 
-def test_measures_draws_and_compares(benchmark, monkeypatch, tmp_path):
-    cores = len(os.sched_getaffinity(0))
-
-    case = benchmark.Case
-
-    def tiny(**changes):
-        settings = {"num_particles": 60, "neighbors": 5, "kernel_size": 2, "in_channels": 4, "out_channels": 3}
-        return case(**changes | settings | {"threads": cores, "out_channels": changes.get("out_channels", 3)})
-
-    sweeps = {name: [tiny(), tiny(out_channels=1)] for name in benchmark.SWEEPS}
-    monkeypatch.setattr(benchmark, "SWEEPS", sweeps)
-    monkeypatch.setattr(benchmark, "HAS_OPEN3D", False)
-    monkeypatch.setattr(benchmark, "Case", tiny)
-    monkeypatch.setattr(benchmark, "in_fresh_process", lambda function, *arguments: function(*arguments))
-    monkeypatch.setattr(benchmark, "extra_megabytes", lambda case, variant: 1.0)
-    table = benchmark.measure_sweeps(0.0)
-    layers = table[table.sweep != "memory"]
-    assert set(layers.variant) == {"ours", "general path", "matrix products"}
-    assert not layers[["low", "ms", "high"]].isna().any().any()
-    assert table.loc[table.variant == "ours", "difference"].max() < 1e-5
-    benchmark.draw(table, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 10_000
-    ratios = benchmark.ratios(benchmark.measure_targets(None, 0.0)).set_index("what").measured
-    assert {"the same: ours / matrix products", "geometry of 100,000 edges / layer"} <= set(ratios.index)
-    assert ratios["extra memory at N = 100,000, MB"] == 1
+@pytest.mark.slow
+def test_the_benchmark_of_predictions_compares_two_states_measures_growth_and_draws(dam_break, tmp_path):
+    out = tmp_path / "out"
+    run("inference", "--data", dam_break, "--before", Path(__file__).parents[1], "--out", out)
+    results = json.loads((out / "inference.json").read_text())
+    for row in results["compared"].values():
+        assert {"before", "now", "before / now"} <= row.keys()
+        assert 0 < row["before / now"]["low"] <= row["before / now"]["median"] <= row["before / now"]["high"]
+    assert results["compared"]["published network"]["published now / this now"]["median"] == 1
+    assert results["growth"].keys() == {"published network", "radial layer", "radial layer, no walls", ANALYTIC}
+    assert len(results["costs"]) == len(results["estimates"]) == 6
+    assert (out / "inference.png").is_file()
 
 
-def test_edges_have_the_neighbours_that_were_asked_for(benchmark, generator):
+def test_quartiles_of_few_times_stay_among_them(benchmark_script):
+    """Quartiles that extrapolate gave a ratio of two times below zero."""
+    found = benchmark_script("inference").quartiles([0.2, 3.0])
+    assert 0.2 <= found["low"] <= found["median"] <= found["high"] <= 3.0
+
+
+def test_edges_have_the_neighbours_that_were_asked_for(benchmark_script, generator):
     positions = torch.rand(500, 3, generator=generator)
-    edges = benchmark.edges_with(positions, 20)
+    edges = benchmark_script("continuous_conv").edges_with(positions, 20)
     assert len(edges) / 500 == pytest.approx(20, rel=0.05)

@@ -35,6 +35,7 @@ def test_the_version_is_printed(cconv):
     assert cconv("--version") == (0, f"cconv {version('cconv')}\n", "")
 
 
+@pytest.mark.integration
 def test_the_package_runs_as_a_module():
     command = [sys.executable, "-m", "cconv", "--version"]
     finished = subprocess.run(command, capture_output=True, text=True, timeout=120)

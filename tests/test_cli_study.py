@@ -162,6 +162,16 @@ def test_a_checkpoint_of_another_task_is_refused(cconv, finished_run):
     assert_one_clear_line(outcome, "density_gradient", "density_rate")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [("run", SMOKE, "--data", "flow"), ("resume", "run"), ("extend", "run", "--stage", "random", "--trials", "1")],
+    ids=lambda command: command[0],
+)
+def test_a_serial_study_is_on_no_cluster(cconv, command):
+    outcome = cconv("study", *command, "--serial", "--address", "127.0.0.1:6379")
+    assert_one_clear_line(outcome, "--serial", "--address", "give one of them")
+
+
 def test_what_is_no_run_or_checkpoint_is_named(cconv, tmp_path):
     assert_one_clear_line(cconv("study", "status", tmp_path), "study.json")
     assert_one_clear_line(cconv("report", tmp_path), "study.json")
@@ -179,6 +189,7 @@ def interrupt(command, ready, timeout=PATIENCE):
     return process.returncode, error.decode()
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     folder = tmp_path / "run"
     long = ["--set", "training.updates=100000", "--set", "search.grace_updates=60"]
@@ -198,6 +209,7 @@ def test_ctrl_c_leaves_a_readable_run_folder(cconv, flow_folder, tmp_path):
     assert load_model(next(folder.glob("trials/*/checkpoint"))).num_parameters > 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_usable_checkpoint_of_a_training(flow_folder, tmp_path):
     folder = tmp_path / "one"
     command = [SCRIPT, "train", SMOKE, "--data", flow_folder, "--out", folder, "--set", "training.updates=1000000"]

@@ -19,6 +19,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from particle_files import METADATA, encode, record_frames, walls, write_hdf5, write_packed
 
+pytestmark = pytest.mark.integration
+
 SPLITS = ("train", "valid", "test")
 MEMBERS = ("position", "particle_type", "velocity", "mass", "viscosity", "boundary_position", "boundary_normal")
 GIVEN = ("--mass", "--particle-spacing", "--frame-dt", "--force")

@@ -26,6 +26,8 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.problem import provenance, with_data_path
 from cconv.study.studies import load_study
 
+pytestmark = pytest.mark.integration
+
 REPOSITORY = SMOKE.parents[1]
 STUDY = SMOKE.read_text()
 SPACE = (REPOSITORY / "search_spaces" / "smoke.toml").read_text()

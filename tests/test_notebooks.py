@@ -37,7 +37,7 @@ def code_cells(path):
 
 @pytest.fixture
 def whole_run(tmp_path):
-    """The committed run with everything that can be recorded."""
+    """A copy of the committed run with everything that can be recorded."""
     run = RunFolder(shutil.copytree(ANALYSIS / "sample_run", tmp_path / "run"))
     run.write("summary.json", whole_summary(run.read("summary.json")))
     (run.path / "explanation").mkdir(exist_ok=True)
@@ -46,6 +46,7 @@ def whole_run(tmp_path):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_shows_charts_and_tables(path, monkeypatch):

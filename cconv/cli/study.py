@@ -8,7 +8,7 @@ from rich.table import Table
 
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.live import StudyDisplay
-from cconv.errors import CConvError
+from cconv.errors import CConvError, ConfigError
 
 if TYPE_CHECKING:
     from cconv.study.records.run_folder import RunFolder
@@ -52,6 +52,10 @@ Storage = Annotated[
         "the run folder.",
     ),
 ]
+Serial = Annotated[
+    bool,
+    typer.Option("--serial", help="Train one configuration after another in this process, without Ray."),
+]
 
 
 @app.command()
@@ -63,15 +67,16 @@ def run(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
     address: Address = None,
+    serial: Serial = False,
     storage: Storage = None,
     settings: Settings = None,
 ) -> None:
     """Run a whole study: the stages that its file declares, then the report.
 
-    Trials run at once on all cores, one core each, and stop early by ASHA. The best configurations and the baseline are
-    retrained with fresh seeds, tested on frames that no stage has seen, and timed alone, in turn. Ctrl-C stops cleanly:
-    what was recorded stays readable (`cconv study status`, `cconv report`), and `cconv study resume` goes on, also
-    after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
+    Trials run at once on all cores, one core each, unless --serial is given, and stop early by ASHA. The best
+    configurations and the baseline are retrained with fresh seeds, tested on frames that no stage has seen, and timed
+    alone, in turn. Ctrl-C stops cleanly: what was recorded stays readable (`cconv study status`, `cconv report`), and
+    `cconv study resume` goes on, also after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
     from cconv.study.declared.search_space import load_space
     from cconv.study.pipeline import begin_study
@@ -79,6 +84,7 @@ def run(
     from cconv.study.running.problem import open_study_data, with_data_path
     from cconv.study.studies import load_study
 
+    _check_place(address, serial)
     config = load_study(study, settings or [])
     if data is not None:
         config = with_data_path(config, data)
@@ -87,7 +93,7 @@ def run(
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
     begin_study(config, space, folder)
     try:
-        _run_stages(folder, address, storage)
+        _run_stages(folder, address, storage, serial)
     except CConvError:
         if not folder.trials():
             folder.remove()  # nothing was learned, and the same command shall work once the input is mended
@@ -95,7 +101,9 @@ def run(
 
 
 @app.command()
-def resume(path: RunPath, data: DataPath = None, address: Address = None, storage: Storage = None) -> None:
+def resume(
+    path: RunPath, data: DataPath = None, address: Address = None, serial: Serial = False, storage: Storage = None
+) -> None:
     """Go on with a study that was interrupted or killed, at most one evaluation interval of each trial behind.
 
     Stages that came to their end are kept, trials that ended too; others go on from their last evaluation, and the
@@ -104,10 +112,11 @@ def resume(path: RunPath, data: DataPath = None, address: Address = None, storag
     from cconv.study.pipeline import move_data
     from cconv.study.records.run_folder import RunFolder
 
+    _check_place(address, serial)
     folder = RunFolder.open(path)
     if data is not None:
         move_data(folder, data)
-    _run_stages(folder, address, storage)
+    _run_stages(folder, address, storage, serial)
 
 
 @app.command()
@@ -116,25 +125,32 @@ def extend(
     stage: Annotated[str, typer.Option("--stage", help="Search to extend, by its name in the study file.")],
     trials: Annotated[int, typer.Option("--trials", min=1, max=100_000, help="How many trials to add.")],
     address: Address = None,
+    serial: Serial = False,
     storage: Storage = None,
 ) -> None:
     """Give a search of a study more trials, and run the stages that read it again on what is trained already."""
     from cconv.study.pipeline import extend_study
     from cconv.study.records.run_folder import RunFolder
 
+    _check_place(address, serial)
     folder = RunFolder.open(path)
     extend_study(folder, stage, trials)
-    _run_stages(folder, address, storage)
+    _run_stages(folder, address, storage, serial)
 
 
-def _run_stages(folder: "RunFolder", address: str | None, storage: str | None) -> None:
+def _check_place(address: str | None, serial: bool) -> None:
+    if serial and address is not None:
+        raise ConfigError("--serial trains in this process and --address on a cluster; give one of them.")
+
+
+def _run_stages(folder: "RunFolder", address: str | None, storage: str | None, serial: bool) -> None:
     """Run what is left of a study, write its report and print its answer."""
     from cconv.report.page import write_report
     from cconv.study.pipeline import run_study
 
     with StudyDisplay(errors) as display:
         try:
-            summary = run_study(folder, display, show_progress, address=address, storage=storage)
+            summary = run_study(folder, display, show_progress, address=address, storage=storage, serial=serial)
         except KeyboardInterrupt:
             write_report(folder)
             errors.print(

@@ -3,7 +3,7 @@
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
@@ -17,8 +17,10 @@ from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import database_answers, open_mirror
-from cconv.study.running.problem import load_problem, open_study_data, with_data_path
-from cconv.study.running.ray_pool import ray_pool, remove_left_behind
+from cconv.study.running.pool import Pool
+from cconv.study.running.private_folder import remove_left_behind
+from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
+from cconv.study.running.serial_pool import SerialPool
 from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
 from cconv.study.studies import recorded_space, recorded_study
@@ -42,6 +44,7 @@ def run_study(
     *,
     address: str | None = None,
     storage: str | None = None,
+    serial: bool = False,
 ) -> dict | None:
     """Run the stages of a study that have not come to their end; every result is on disk before the next begins.
 
@@ -51,6 +54,7 @@ def run_study(
         progress: Wraps an iterable to show progress, given a label.
         address: A Ray cluster; None for this machine.
         storage: Database of the Optuna study; None for a journal file in the folder.
+        serial: Whether to train one configuration after another in this process, without Ray.
 
     Returns:
         The summary, as it stands in summary.json; None if no stage selects.
@@ -66,7 +70,7 @@ def run_study(
         try:
             study, space = recorded_study(run), recorded_space(run)
             run.set_state("running", stage)
-            with _session(study, space, run, observer, progress, address, storage) as session:
+            with _session(study, space, run, observer, progress, address, storage, serial) as session:
                 for stage, settings in study.stages.items():
                     if not run.has_result(stage):
                         run.set_state("running", stage)
@@ -131,12 +135,13 @@ def _session(
     progress: Progress,
     address: str | None,
     storage_url: str | None,
+    serial: bool,
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
     dataset = open_study_data(study.data, study.seeds.data)
     findings = dataset_findings(dataset, progress)
     observer.on_data([str(finding) for finding in findings])
-    described = describe_environment(study, dataset)
+    described = describe_environment(study, dataset, 1 if serial else study.concurrency)
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
@@ -151,7 +156,7 @@ def _session(
 
         def start_pool():
             if not pools:
-                pools.append(stack.enter_context(ray_pool(study, problem, run.path / RAY_FILES, address)))
+                pools.append(stack.enter_context(_pool(study, problem, run, address, serial)))
             return pools[0]
 
         if address is not None:
@@ -172,3 +177,13 @@ def _session(
             progress=progress,
             useless_error=normalized_mse(mean_predictor_error(problem.valid_samples, problem.train_samples)),
         )
+
+
+def _pool(
+    study: StudyConfig, problem: Problem, run: RunFolder, address: str | None, serial: bool
+) -> AbstractContextManager[Pool]:
+    if serial:
+        return nullcontext(SerialPool(study, problem))
+    from cconv.study.running.ray_pool import ray_pool  # a serial study runs where there is no Ray
+
+    return ray_pool(study, problem, run.path / RAY_FILES, address)

@@ -15,7 +15,7 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -67,6 +67,33 @@ SWEEPS = {
     ],
     "threads": [Case(threads=threads) for threads in (1, 2)],
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is measured.
+
+    Attributes:
+        case: Layer of the targets.
+        sweeps: Layers by what varies among them.
+        counts: Particles of layers whose memory is measured; the last is that of the target.
+        seconds: Measuring time of each case and quantity.
+    """
+
+    case: Case
+    sweeps: Mapping[str, Sequence[Case]]
+    counts: tuple[int, ...]
+    seconds: float
+
+
+def whole_plan(seconds: float) -> Plan:
+    return Plan(case=Case(), sweeps=SWEEPS, counts=(4000, 20_000, 100_000), seconds=seconds)
+
+
+def smoke_plan() -> Plan:
+    """Layers too small for their figures to mean anything, to see that the script runs."""
+    tiny = Case(num_particles=60, neighbors=5, kernel_size=2, in_channels=4, out_channels=3, threads=1)
+    return Plan(case=tiny, sweeps={name: [tiny] for name in SWEEPS}, counts=(200,), seconds=0.0)
 
 
 def edges_with(positions: Tensor, neighbors: int) -> Edges:
@@ -293,26 +320,27 @@ def in_fresh_process(function: Callable, *arguments) -> object:
         return pool.submit(function, *arguments).result()
 
 
-def measure_targets(data: Path | None, seconds: float) -> pd.DataFrame:
+def measure_targets(data: Path | None, plan: Plan) -> pd.DataFrame:
     """What the ratios need, with many repeats and without the general path, which takes ten times as long."""
     rows = []
-    for case in (Case(), Case(in_channels=64, out_channels=1)):
-        rows += in_fresh_process(measure_layer, case, seconds, False)
-    rows += in_fresh_process(measure_geometry, Case(), seconds)
-    rows += measure_memory((100000,))
+    for case in (plan.case, replace(plan.case, in_channels=min(64, plan.case.in_channels), out_channels=1)):
+        rows += in_fresh_process(measure_layer, case, plan.seconds, False)
+    rows += in_fresh_process(measure_geometry, plan.case, plan.seconds)
+    rows += measure_memory(plan.counts[-1:])
     if data is not None:
-        rows += [{"quantity": "training step", **row} for row in summary(in_turn(training_steps(data), 5 * seconds))]
+        times = in_turn(training_steps(data), 5 * plan.seconds)
+        rows += [{"quantity": "training step", **row} for row in summary(times)]
     return pd.DataFrame(rows)
 
 
-def measure_sweeps(seconds: float) -> pd.DataFrame:
+def measure_sweeps(plan: Plan) -> pd.DataFrame:
     """All layers of the sweeps, and the memory over the number of particles."""
     rows = []
-    for sweep, cases in SWEEPS.items():
+    for sweep, cases in plan.sweeps.items():
         for case in cases:
             print(f"{sweep}: {case}", flush=True)
-            rows += [{"sweep": sweep, **row} for row in in_fresh_process(measure_layer, case, seconds, True)]
-    return pd.DataFrame(rows + [{"sweep": "memory", **row} for row in measure_memory((4000, 20000, 100000))])
+            rows += [{"sweep": sweep, **row} for row in in_fresh_process(measure_layer, case, plan.seconds, True)]
+    return pd.DataFrame(rows + [{"sweep": "memory", **row} for row in measure_memory(plan.counts)])
 
 
 def measure_memory(counts: tuple[int, ...]) -> list[dict]:
@@ -324,7 +352,7 @@ def measure_memory(counts: tuple[int, ...]) -> list[dict]:
     ]
 
 
-def ratios(table: pd.DataFrame) -> pd.DataFrame:
+def ratios(table: pd.DataFrame, plan: Plan) -> pd.DataFrame:
     """The figures that the project holds itself to, with the bound of each."""
     table = table.reindex(columns=[*table.columns, *{"MB", "difference"} - set(table.columns)])
 
@@ -332,7 +360,7 @@ def ratios(table: pd.DataFrame) -> pd.DataFrame:
         rows = table[(table.variant == variant) & (table.quantity == quantity)]
         return (rows if out_channels is None else rows[rows.out_channels == out_channels]).ms.median()
 
-    both, step, wide = "forward + backward", "training step", Case().out_channels
+    both, step, wide = "forward + backward", "training step", plan.case.out_channels
     memory = table[(table.quantity == "memory") & (table.variant == "ours")]
     rows = [
         ("96 to 64, forward + backward: Open3D / ours", ms("Open3D", both, wide) / ms("ours", both, wide), ">= 3"),
@@ -396,14 +424,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="DeepLagrangianFluids folder for the training step")
     parser.add_argument("--seconds", type=float, default=3.0, help="measuring time of each case and quantity")
     parser.add_argument("--targets-only", action="store_true", help="leave out the sweeps, which take some minutes")
+    parser.add_argument("--smoke", action="store_true", help="tiny layers, to see that the script runs")
     arguments = parser.parse_args()
+    plan = smoke_plan() if arguments.smoke else whole_plan(arguments.seconds)
     out = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    targets = measure_targets(arguments.data, arguments.seconds)
+    targets = measure_targets(arguments.data, plan)
     targets.to_csv(out / "targets.csv", index=False, float_format="%.5g")
-    print(ratios(targets).to_string(index=False, float_format="%.3g"), flush=True)
+    print(ratios(targets, plan).to_string(index=False, float_format="%.3g"), flush=True)
     if not arguments.targets_only:
-        sweeps = measure_sweeps(arguments.seconds)
+        sweeps = measure_sweeps(plan)
         sweeps.to_csv(out / "sweeps.csv", index=False, float_format="%.5g")
         draw(sweeps, out / "sweeps.png")
 

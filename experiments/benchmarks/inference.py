@@ -17,8 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -66,6 +67,33 @@ CHECKED = COMPARED | {
 }
 SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000, 50_000) for periodic in (False, True)]
 SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is measured.
+
+    Attributes:
+        checked: Networks, by name, whose times the cost model predicts.
+        searches: Dimension, number of particles and periodicity of each neighbour search.
+        sizes: Numbers of particles over which times grow.
+        rounds: Timed calls of each.
+    """
+
+    checked: Mapping[str, Mapping]
+    searches: Sequence[tuple[int, int, bool]]
+    sizes: Sequence[int]
+    rounds: int
+
+
+def whole_plan(rounds: int) -> Plan:
+    return Plan(checked=CHECKED, searches=SEARCHES, sizes=(1000, 3000, 10_000, 30_000, 100_000), rounds=rounds)
+
+
+def smoke_plan() -> Plan:
+    """Sizes too small for the figures to mean anything, to see that the script runs."""
+    searches = [(dim, 100, periodic) for dim in (1, 2, 3) for periodic in (False, True)]
+    return Plan(checked=dict(islice(CHECKED.items(), 6)), searches=searches, sizes=(50, 100), rounds=2)
 
 
 def frame_of(folder: Path) -> tuple[Scene, Frame]:
@@ -150,12 +178,12 @@ def quartiles(values: list[float]) -> dict[str, float]:
     return {"median": median, "low": low, "high": high}
 
 
-def compare(checkouts: Mapping[str, Path], data: Path, searches: list, rounds: int) -> dict:
+def compare(checkouts: Mapping[str, Path], data: Path, plan: Plan) -> dict:
     """Times of each call in each state, and ratios within a round; the first round is a warm-up."""
-    states = {name: State(checkout, data, searches) for name, checkout in checkouts.items()}
-    names = [*COMPARED, *map(json.dumps, searches)]
+    states = {name: State(checkout, data, plan.searches) for name, checkout in checkouts.items()}
+    names = [*COMPARED, *map(json.dumps, plan.searches)]
     times = {name: {state: [] for state in states} for name in names}
-    for turn in range(rounds + 1):
+    for turn in range(plan.rounds + 1):
         for name in names:
             for state, process in states.items():
                 parts = process.time(name)
@@ -185,7 +213,7 @@ def ratio(numerators: list[float], denominators: list[float]) -> dict[str, float
     return quartiles([a / b for a, b in zip(numerators, denominators, strict=True)])
 
 
-def measure_checks(data: Path, rounds: int) -> dict:
+def measure_checks(data: Path, plan: Plan) -> dict:
     """Growth of the compared models, and the cost model's predictions for many."""
 
     from cconv.evaluation.cost import measure_costs, measure_growth
@@ -195,12 +223,14 @@ def measure_checks(data: Path, rounds: int) -> dict:
     sample = sample_of(scene, frame)
     around = neighbor_density(sample.inputs, 2.0)
     with tempfile.TemporaryDirectory() as folder:
-        saved = {name: Path(folder) / str(place) for place, name in enumerate(CHECKED)}
+        saved = {name: Path(folder) / str(place) for place, name in enumerate(plan.checked)}
         for name, path in saved.items():
-            save_model(model_of(CHECKED[name], scene, sample), path, {})
+            save_model(model_of(plan.checked[name], scene, sample), path, {})
         compared = {name: saved[name] for name in COMPARED}
         field = load_model(saved["published network"]).config
-        growth = measure_growth(compared, load_model, analytic=field, threads=1, repeats=max(2, rounds // 4))
+        growth = measure_growth(
+            compared, load_model, analytic=field, sizes=plan.sizes, threads=1, repeats=max(2, plan.rounds // 4)
+        )
         costs, analytic = measure_costs(
             saved,
             load_model,
@@ -208,10 +238,10 @@ def measure_checks(data: Path, rounds: int) -> dict:
             scene,
             task=task_named("density_rate"),
             threads=1,
-            repeats=max(2, rounds // 2),
+            repeats=max(2, plan.rounds // 2),
         )
     counted = {}
-    for name, settings in CHECKED.items():
+    for name, settings in plan.checked.items():
         features, network, _ = configure(settings, DEFAULTS)
         walls = Kinds(0, 1) if WALLS in features else None
         counted[name] = network.count(kinds_of(features), walls, Kinds(1, 0), DIM, around)
@@ -311,19 +341,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "inference")
     parser.add_argument("--before", type=Path, help="checkout of an earlier state to compare with")
     parser.add_argument("--rounds", type=int, default=20, help="timed calls of each")
+    parser.add_argument("--smoke", action="store_true", help="small sizes, to see that the script runs")
     parser.add_argument("--serve", type=json.loads, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.serve is not None:
         serve(arguments.data, [tuple(search) for search in arguments.serve])
         return
+    plan = smoke_plan() if arguments.smoke else whole_plan(arguments.rounds)
     checkouts = {"before": arguments.before} if arguments.before else {}
     checkouts["now"] = Path(__file__).parents[2]
     results = {
         "machine": f"{os.cpu_count()} cores, torch {torch.__version__}",
         "num_particles": len(frame_of(arguments.data)[1].positions),
         "threads": 1,
-        "compared": compare(checkouts, arguments.data, SEARCHES, arguments.rounds),
-        **measure_checks(arguments.data, arguments.rounds),
+        "compared": compare(checkouts, arguments.data, plan),
+        **measure_checks(arguments.data, plan),
     }
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "inference.json").write_text(json.dumps(results, indent=1) + "\n")

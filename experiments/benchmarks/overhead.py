@@ -50,8 +50,9 @@ def seconds_alone(study: StudyConfig, problem: Problem, folder: Path, repeats: i
     for job in jobs(folder, repeats):
         start = time.perf_counter()
         seeds = {"init_seed": job.init_seed, "data_seed": study.seeds.data}
-        settings = (study.network, study.training, TrialFolder(job.folder))
-        list(run_trial(problem, {}, *settings, stage="alone", provenance=provenance(study), **seeds))
+        folder_of_job = TrialFolder(job.folder)
+        facts = {"stage": "alone", "provenance": provenance(study), **seeds}
+        list(run_trial(problem, {}, study.configuration, folder_of_job, **facts))
         taken.append(time.perf_counter() - start)
     return statistics.median(taken)
 

@@ -20,6 +20,8 @@ from cconv.data.simulate import simulate
 from cconv.errors import ConfigError, DataError, SimulationError
 from cconv.scenes import SCENES, scene_named
 
+pytestmark = pytest.mark.integration
+
 FILES = ("train.h5", "valid.h5", "test.h5", "metadata.json")
 LAGRANGEBENCH_KEYS = {
     "case", "solver", "density_evolution", "dim", "dx", "dt", "t_end", "viscosity", "p_bg_factor", "g_ext_magnitude",
@@ -176,6 +178,7 @@ def test_unfinished_trajectories_of_other_settings_are_not_mixed_in(tmp_path, mo
     assert (tmp_path / "a" / "train.h5").read_bytes() == (tmp_path / "b" / "train.h5").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_generation_goes_on_where_it_stopped(tmp_path):
     """`kill -9` of the whole process group; the command that is given again redoes no finished trajectory."""
     command = [
@@ -268,6 +271,7 @@ def test_a_second_run_into_the_same_folder_is_refused(tmp_path, monkeypatch):
         made(tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_parent_and_at_an_interrupt(tmp_path):
     """Even within a relaxation that would take minutes."""
     command = [

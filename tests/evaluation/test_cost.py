@@ -46,6 +46,7 @@ def measured(models, generator, repeats=4, task="density_rate"):
     return measure_costs(models, load_model, frames, scene, task=task_named(task), threads=1, repeats=repeats)
 
 
+@pytest.mark.integration
 def test_measured_costs_are_consistent(generator, tmp_path):
     models = {"small": saved_models(generator, tmp_path)["small"]}
     found, analytic = measured(models, generator)

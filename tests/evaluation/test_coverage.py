@@ -97,7 +97,7 @@ def check(name: str, found: float, times: int) -> None:
 def test_an_interval_covers_as_it_says_over_all_sizes(name):
     """A few simulations of each size and spread, taken together."""
     rng, sizes = np.random.default_rng(0), [(shape, spreads) for shape in SHAPES for spreads in SPREADS]
-    times = 480 // len(sizes)
+    times = 240 // len(sizes)
     found = [coverage(lambda case=case: INTERVALS[name](rng, *case), times) for case in sizes]
     check(name, float(np.mean(found)), times * len(sizes))
 
@@ -126,8 +126,8 @@ DISTRIBUTIONS = {
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 def test_the_share_of_the_seeds_is_covered(distribution):
     rng = np.random.default_rng(2)
-    found = coverage(lambda: share_of_variances(rng, (8, 32), DISTRIBUTIONS[distribution]), 400)
-    check("share of the seeds", found, 400)
+    found = coverage(lambda: share_of_variances(rng, (8, 32), DISTRIBUTIONS[distribution]), 150)
+    check("share of the seeds", found, 150)
 
 
 @pytest.mark.slow
@@ -173,7 +173,7 @@ def coverage_of_a_share(rng, name, residuals, share, shape) -> float:
 @pytest.mark.parametrize("trials", [24, 36, 100])
 @pytest.mark.parametrize("name", HYPERPARAMETERS)
 def test_the_share_of_a_hyperparameter_is_covered(name, trials):
-    rng, times = np.random.default_rng(5), 200
+    rng, times = np.random.default_rng(5), 60
     cases = [(residuals, share) for residuals in RESIDUALS for share in STRENGTHS]
     found = [coverage_of_a_share(rng, name, *case, (times, trials)) for case in cases]
     check(f"share of a {name}", float(np.mean(found)), times * len(cases))
@@ -199,7 +199,7 @@ def rank_correlation(rng, trials, correlation) -> Simulated:
 
 @pytest.mark.parametrize("trials", [12, 16, 32])
 def test_the_rank_correlation_of_a_rung_is_covered(trials):
-    rng, times = np.random.default_rng(7), 150
+    rng, times = np.random.default_rng(7), 60
     found = [coverage(lambda r=r: rank_correlation(rng, trials, r), times) for r in (0.0, 0.6, 0.9)]
     check("rank correlation", float(np.mean(found)), 3 * times)
 

@@ -28,6 +28,8 @@ from cconv.sph import CubicSpline
 from cconv.tasks import task_named
 from cconv.tasks.samples import make_sample
 
+pytestmark = pytest.mark.integration
+
 NETWORK = configured(layers=1, architecture="radial_net", message="difference", relative_cutoff=2.0)
 TASKS = ("density_rate", "density_gradient")
 SCENES = [

@@ -35,6 +35,7 @@ def test_saving_again_replaces_and_leaves_nothing_behind(saved):
     assert [path.name for path in folder.parent.iterdir()] == ["checkpoint"]
 
 
+@pytest.mark.integration
 def test_a_kill_at_any_time_leaves_a_whole_model(saved):
     """A child process replaces the model and ends itself at its first file operation, then at its second, and so on."""
     given, model, folder = saved

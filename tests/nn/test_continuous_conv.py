@@ -220,6 +220,7 @@ def test_stated_memory_is_what_is_held(cloud):
     assert sum(tensor.nbytes for tensor in [*own, *reads.by_sender]) == reads.nbytes
 
 
+@pytest.mark.slow
 def test_a_compiled_graph_gives_the_same(cloud, generator):
     features, filters = normal(generator, 30, 3), normal(generator, 4, 4, 4, 3, 5)
     geometry = ConvGeometry(radius_graph(cloud, 0.4), 4)

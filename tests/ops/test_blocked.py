@@ -150,6 +150,7 @@ print(sum(sum(loop.stats.cache_hits.values()) for loop in loops))
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     counts = []

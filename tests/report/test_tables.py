@@ -138,6 +138,7 @@ def test_verdicts_leave_a_gap_for_finalists_that_were_not_measured(summary):
     assert verdict_matrix(summary) == []
 
 
+@pytest.mark.integration
 def test_what_notebooks_import_needs_neither_ray_nor_torch():
     modules = (
         "tables",

@@ -34,6 +34,7 @@ def test_published_sizes_are_those_of_lagrangebench(name, generator):
     assert scene.steps_per_frame == 100
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", SCENES)
 def test_small_scenes_run_and_say_what_they_have(name, generator):
     scene = scene_named(name, "small", relaxation_steps=50)
@@ -97,6 +98,7 @@ def test_walls_are_three_layers_around_the_cells():
     assert len(open_sides) == 4 * 6
 
 
+@pytest.mark.integration
 def test_drop_follows_the_ellipse_of_monaghan():
     """Half axes a, b of a drop with velocity A (-x, y): da/dt = -A a, db/dt = A b, dA/dt = A² (a² - b²)/(a² + b²)."""
     scene = scene_named("free_drop_2d", "small", particle_spacing=0.05)

@@ -20,6 +20,8 @@ from studies import write_search
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.optuna_mirror import open_storage
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def study_file(tmp_path):

@@ -1,13 +1,10 @@
 """One whole study of the smallest size, looked at from all sides."""
 
 import json
-import subprocess
 
 import optuna
 import pytest
 import torch
-from conftest import SCRIPT
-from processes import PATIENCE
 
 from cconv import load_model, open_dataset
 from cconv.models.errors import frame_errors, normalized_mse
@@ -33,6 +30,14 @@ def test_the_baseline_is_trained_to_the_full_budget_and_is_a_finalist(run, summa
     (baseline,) = run.trials_of("baseline")
     assert (baseline.outcome, baseline.parameters) == ("completed", fixed(space, "boundary").baseline)
     assert summary["baseline"] in {entry["id"] for entry in summary["finalists"]}
+
+
+def test_a_serial_study_ran_where_ray_cannot_be_imported_and_says_that_it_trained_one_at_a_time(run):
+    """The fixture blocks the import of Ray."""
+    environment = run.read("environment.json")
+    assert environment["command"][0] == "-c"
+    assert environment["threads"]["trials_at_once"] == 1
+    assert not (run.path / "ray").exists()
 
 
 def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
@@ -97,13 +102,14 @@ def test_finalists_were_retrained_with_seeds_that_the_search_did_not_use(run):
         assert search_seed not in seeds
 
 
-def test_the_checkpoint_gives_the_reported_test_error_again(run, summary, flow_folder):
+@pytest.mark.parametrize("split", ["valid", "test"])
+def test_the_checkpoint_gives_the_reported_errors_again(run, summary, flow_folder, split):
     dataset = open_dataset(flow_folder)
     for entry in summary["finalists"]:
         model = load_model(run.path / entry["checkpoint"], task=summary["task"])
-        errors = frame_errors(model, iterate_samples(dataset, "test", model.task))
+        errors = frame_errors(model, iterate_samples(dataset, split, model.task))
         seed = (run.path / entry["checkpoint"]).parent.name
-        assert normalized_mse(errors) == pytest.approx(entry["test"]["by_seed"][seed], rel=1e-6)
+        assert normalized_mse(errors) == pytest.approx(entry[split]["by_seed"][seed], rel=1e-6)
         assert model.num_parameters == entry["num_parameters"]
 
 
@@ -162,9 +168,9 @@ def test_nothing_half_written_remains(run):
 def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, summary):
     path = summary["ablation"]["path"]
     space = fixed(SearchSpace.model_validate(run.read("space.json")), "boundary")
-    if path:
-        assert path[0]["parameters"] == space.baseline
-        assert all(step["valid_normalized_mse"] > 0 for step in path)
+    assert path[0]["parameters"] == space.baseline
+    assert len(path) > 1
+    assert all(step["valid_normalized_mse"] > 0 for step in path)
     (density,) = [entry for entry in summary["ablation"]["branches"] if entry["left_out"] == "density"]
     assert density["valid_normalized_mse"] > 0
 
@@ -219,14 +225,16 @@ repeats = 3
 """
 
 
-def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp_path):
+@pytest.mark.integration
+def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(cconv, flow_folder, tmp_path):
     """With no challenger at the full budget left, the baseline is alone. More trials go on from there."""
     (tmp_path / "space.toml").write_text(SPACE_WITH_FAILURES)
     (tmp_path / "failures.toml").write_text(STUDY_WITH_FAILURES.format(space=tmp_path / "space.toml"))
     folder = tmp_path / "run"
-    command = [SCRIPT, "study", "run", tmp_path / "failures.toml", "--data", flow_folder, "--out", folder]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-    assert finished.returncode == 0, finished.stderr
+    status, _, error = cconv(
+        "study", "run", tmp_path / "failures.toml", "--serial", "--data", flow_folder, "--out", folder
+    )
+    assert status == 0, error
     run = RunFolder.open(folder)
     failed = [record for record in run.trials() if record.outcome == "failed"]
     assert {record.parameters["relative_cutoff"] for record in failed} == {6.0}
@@ -235,9 +243,8 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(flow_folder, tmp
     assert counts["random"]["failed"] + counts["adaptive"]["failed"] == len(failed) >= 1
     assert [entry["id"] for entry in run.read("summary.json")["finalists"]] == ["baseline"]
     before = {record.id: record.log for record in run.trials()}
-    command = [SCRIPT, "study", "extend", folder, "--stage", "random", "--trials", "3"]
-    extended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-    assert extended.returncode == 0, extended.stderr
+    status, _, error = cconv("study", "extend", folder, "--serial", "--stage", "random", "--trials", "3")
+    assert status == 0, error
     after = {record.id: record.log for record in run.trials()}
     assert len(after) == 9
     assert {trial: log for trial, log in after.items() if trial in before} == before

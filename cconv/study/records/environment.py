@@ -14,7 +14,7 @@ from cconv.study.declared.study_file import StudyConfig
 PACKAGES = ("cconv", "torch", "numpy", "scipy", "ray", "optuna", "h5py", "pandas", "pydantic")
 
 
-def describe_environment(study: StudyConfig, dataset: Dataset) -> dict:
+def describe_environment(study: StudyConfig, dataset: Dataset, trials_at_once: int) -> dict:
     """Provenance of a run, as it stands in environment.json."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -26,7 +26,7 @@ def describe_environment(study: StudyConfig, dataset: Dataset) -> dict:
         "processor": _processor(),
         "cores": os.cpu_count(),
         "device": "cpu",
-        "threads": {"training": 1, "cost": study.cost.threads, "trials_at_once": study.concurrency},
+        "threads": {"training": 1, "cost": study.cost.threads, "trials_at_once": trials_at_once},
         "seeds": study.seeds.model_dump(),
         "data": {"path": str(dataset.path), "sha256": dataset.fingerprint()},
     }

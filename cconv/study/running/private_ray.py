@@ -4,14 +4,11 @@ Ray runs whatever code a client sends it. So a Ray of ours demands a token that 
 on this machine, and binds every port to 127.0.0.1; a cluster that is joined must demand a token too.
 """
 
-import fcntl
 import os
 import secrets
-import shutil
 import stat
-import tempfile
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import psutil
@@ -21,61 +18,8 @@ from ray.exceptions import AuthenticationError
 
 from cconv.errors import ConfigError
 
-PREFIX = "cconv-"
-LONGEST_SOCKET = 107  # bytes of a socket's path that Linux takes
-SESSION = "/ray/session_2026-01-01_00-00-00_000000_0000000/sockets/plasma_store"  # the longest that Ray appends
 TOKEN = "token"
 TOKEN_VARIABLES = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-
-
-@contextmanager
-def private_folder() -> Iterator[Path]:
-    """A short folder for Ray's files and the token of this run, for its owner's eyes; it goes when the run ends.
-
-    Raises:
-        ConfigError: If no folder for temporary files is short enough and can be written to.
-    """
-    with ExitStack() as stack:
-        folder = _made_folder()
-        while not stack.enter_context(_locked(folder)):  # another run took it for left behind before it was locked
-            folder = _made_folder()
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        yield folder
-
-
-def remove_private_folders() -> None:
-    """Delete the private folders of runs that were killed: those of this user that no process has locked."""
-    for folder in (each for place in _places() for each in Path(place).glob(f"{PREFIX}????????")):
-        try:
-            if folder.is_symlink() or not folder.is_dir() or folder.stat().st_uid != os.getuid():
-                continue
-            with _locked(folder) as is_ours:
-                if is_ours:
-                    shutil.rmtree(folder, ignore_errors=True)
-        except OSError:  # already gone
-            continue
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[bool]:
-    """Hold a folder for this process alone, however that ends; False if another holds it or has deleted it."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except FileNotFoundError:
-        yield False
-        return
-    try:
-        yield _lock(descriptor) and folder.exists()
-    finally:
-        os.close(descriptor)
-
-
-def _lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def demand_tokens() -> None:
@@ -173,26 +117,3 @@ def _check_only_owner_reads(path: Path, address: str) -> None:
     if not is_ours:
         fault, cure = "belongs to another user", f"chown $USER {path} && {cure}"
     raise ConfigError(f"--address {address}: {path} {fault}, and who reads the token runs code as you; `{cure}`.")
-
-
-def _made_folder() -> Path:
-    """A folder of mode 0700 in the first place for temporary files where sockets of Ray have names short enough."""
-    reasons = []
-    for place in _places():
-        room = LONGEST_SOCKET - len(os.fsencode(f"{place}/{PREFIX}12345678{SESSION}"))
-        if room < 0:
-            reasons.append(f"{place} is {-room} bytes too long")
-            continue
-        try:
-            return Path(tempfile.mkdtemp(prefix=PREFIX, dir=place))
-        except OSError as error:
-            reasons.append(f"{place}: {error.strerror}")
-    raise ConfigError(
-        f"no place for Ray's temporary files ({'; '.join(reasons)}); set TMPDIR to a short folder that you can write "
-        "to."
-    )
-
-
-def _places() -> list[str]:
-    """Folders for temporary files, the one that the user wants first."""
-    return list(dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")))

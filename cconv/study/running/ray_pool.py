@@ -27,33 +27,27 @@ from ray.exceptions import RayError  # noqa: E402
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
-from cconv.errors import ConfigError, is_disk_full  # noqa: E402
-from cconv.study.declared.configuration import TrainingConfig
-from cconv.study.declared.study_file import StudyConfig
-from cconv.study.records.trials import TrialFolder
-from cconv.study.running.attempt import Attempt  # noqa: E402
+from cconv.errors import ConfigError  # noqa: E402
+from cconv.study.declared.configuration import TrainingConfig  # noqa: E402
+from cconv.study.declared.study_file import StudyConfig  # noqa: E402
+from cconv.study.running.private_folder import private_folder  # noqa: E402
 from cconv.study.running.private_ray import (  # noqa: E402
     asking_once,
     check_token_of_cluster,
     demand_tokens,
     kill_processes_of,
     on_loopback_alone,
-    private_folder,
-    remove_private_folders,
     token_of_this_run,
 )
-from cconv.study.running.problem import Problem, provenance  # noqa: E402
-from cconv.study.running.trial import run_trial  # noqa: E402
+from cconv.study.running.problem import Problem  # noqa: E402
+from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, train_recorded  # noqa: E402
 from cconv.study.running.trial_queue import Job, TrialQueue  # noqa: E402
-from cconv.training.loop import TrainingState  # noqa: E402
 
 QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # what fails is in our records
 OBJECT_STORE_BYTES = 2**30
 STARTS = 3  # of a Ray of our own; on a busy machine it may take longer than the 30 seconds that it gives itself
 CONNECTION_SECONDS = 5.0
 RESTARTS = 2  # of a training whose process or node died; it goes on from its last evaluation
-HANGING = 2.0  # times its limit after which a training's process is ended from outside
-DISK_FULL = "disk full"
 
 
 @contextmanager
@@ -77,12 +71,6 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
         _start(study.concurrency, own) if address is None else _join(address)
         ray._private.worker._worker_logs_enabled = False  # our records say what died
         yield RayPool(study, problem, folder)
-
-
-def remove_left_behind(folder: Path) -> None:
-    """Delete what killed runs left of Ray: its files of the run in `folder`, and private folders of the same user."""
-    shutil.rmtree(folder, ignore_errors=True)
-    remove_private_folders()
 
 
 def _start(cores: int, folder: Path) -> None:
@@ -124,7 +112,7 @@ def _join(address: str) -> None:
 
 
 class RayPool:
-    """Runs the trainings of a stage.
+    """A `Pool` that trains as many jobs at once as there are cores, each in a process of its own.
 
     Args:
         study: The study.
@@ -233,8 +221,7 @@ class _Driver(_NeverRestored, tune.Callback):
         last = trial.last_result
         with self._ends_the_run() as queue:
             if last["outcome"] == DISK_FULL:
-                job = trial.config["job"]
-                raise ConfigError(f"{job.folder}: {last['reason']}; make room, then `cconv study resume`.")
+                raise disk_is_full(trial.config["job"], last["reason"])
             queue.on_end(str(trial), last["outcome"] or queue.outcome_after(last), last["reason"])
 
     def on_trial_error(self, iteration, trials, trial, **info) -> None:
@@ -283,54 +270,7 @@ class _Silent(tune.ProgressReporter):
 
 
 def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem) -> None:
-    """Train a job; every evaluation is reported, then how it ended if the training itself knows."""
+    """Train a job in a process of Ray, and tell Ray every report."""
     torch.set_num_threads(1)
-    limit = _seconds_limit(study, training)
-    last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
-    outcome, reason = None, ""
-    try:
-        with Attempt(job.folder, HANGING * limit) as attempt:
-            for last in _trial(job, stage, training, study, problem, attempt):
-                tune.report(last | {"outcome": None, "reason": ""})
-        if not last["diverged"] and last["updates"] < training.updates:
-            outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
-    except Exception as error:
-        outcome, reason = DISK_FULL if is_disk_full(error) else "failed", str(error) or type(error).__name__
-    if outcome is not None:
-        _record_what_failed(job, stage, outcome)
-        tune.report(last | {"outcome": outcome, "reason": reason})
-
-
-def _seconds_limit(study: StudyConfig, training: TrainingConfig) -> float:
-    """Time that a training may take: the limit of a trial, and more in proportion for a budget beyond a trial's."""
-    return study.search.trial_seconds * max(1.0, training.updates / study.training.updates)
-
-
-def _trial(
-    job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem, attempt: Attempt
-) -> Iterator[dict]:
-    def check_before_writing(state: TrainingState) -> None:
-        if state.valid_normalized_mse is not None or state.diverged:
-            attempt.check()
-
-    folder = TrialFolder(job.folder)
-    yield from folder.log()[-1:]  # an earlier attempt may have died before it was judged
-    yield from run_trial(
-        problem,
-        job.parameters,
-        study.configuration._replace(training=training),
-        folder,
-        stage=stage,
-        init_seed=job.init_seed,
-        data_seed=study.seeds.data,
-        provenance=provenance(study),
-        seconds_limit=_seconds_limit(study, training),
-        on_update=check_before_writing,
-    )
-
-
-def _record_what_failed(job: Job, stage: str, outcome: str) -> None:
-    folder = TrialFolder(job.folder)
-    if outcome == "failed" and not folder.started:  # it failed before it could say what it is
-        known = {"stage": stage, "parameters": job.parameters, "init_seed": job.init_seed}
-        folder.start(known | {"num_parameters": None, "flops_per_particle": None})
+    for report in train_recorded(job, stage, training, study, problem):
+        tune.report(report.entry | {"outcome": report.outcome, "reason": report.reason})

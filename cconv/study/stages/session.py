@@ -16,6 +16,7 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
+from cconv.study.running.pool import Pool
 from cconv.study.running.problem import Problem
 
 Progress = Callable[[Iterable, str], Iterable]
@@ -33,7 +34,7 @@ class Session:
         run: Where everything is recorded.
         observer: Sees the trials as they run.
         mirror: Repeats searches in Optuna's storage.
-        start_pool: Gives the `RayPool`; starts it at the first call.
+        start_pool: Gives what trains the jobs of a stage; starts it at the first call.
         count_cost: Counts the cost of a configuration, before anything is built.
         progress: Wraps an iterable to show progress, given a label.
         useless_error: What predicting the training mean scores on the validation split.
@@ -46,7 +47,7 @@ class Session:
     run: RunFolder
     observer: Observer
     mirror: Observer
-    start_pool: Callable
+    start_pool: Callable[[], Pool]
     count_cost: CostCounter
     progress: Progress
     useless_error: float

@@ -40,6 +40,7 @@ def test_a_superseded_attempt_leaves_its_successor_in_place_when_it_ends(tmp_pat
     current.__exit__()
 
 
+@pytest.mark.integration
 def test_a_process_that_hangs_is_ended_and_no_attempt_follows(tmp_path):
     assert subprocess.run([sys.executable, "-c", HANG, tmp_path], timeout=PATIENCE).returncode != 0
     with pytest.raises(Hanging, match=r"hung and was ended after 0\.2 seconds"), Attempt(tmp_path, 0.2):

@@ -4,7 +4,6 @@ import os
 import stat
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import psutil
@@ -14,7 +13,7 @@ from conftest import SMOKE
 from processes import PATIENCE, tree
 
 from cconv.errors import ConfigError
-from cconv.study.running.private_ray import PREFIX, check_token_of_cluster, private_folder, remove_private_folders
+from cconv.study.running.private_ray import check_token_of_cluster
 from cconv.study.running.ray_pool import ray_pool
 from cconv.study.studies import load_study
 
@@ -54,6 +53,7 @@ def join(address, *arguments, user=None, **environment):
     return run.stdout
 
 
+@pytest.mark.slow
 def test_everything_listens_on_loopback_alone(running):
     processes = tree(os.getpid())
     listeners = {
@@ -66,6 +66,7 @@ def test_everything_listens_on_loopback_alone(running):
     assert {ip for _, ip in listeners} <= set(LOOPBACK)
 
 
+@pytest.mark.slow
 def test_only_the_owner_reads_the_token_and_no_command_line_or_environment_holds_it(running):
     _, path = running
     token = path.read_text()
@@ -77,6 +78,7 @@ def test_only_the_owner_reads_the_token_and_no_command_line_or_environment_holds
         assert token not in process.environ().values()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
     [{"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}],
@@ -86,12 +88,14 @@ def test_who_has_no_token_or_a_wrong_one_cannot_join(running, environment):
     assert join(running[0], **environment).startswith("refused AuthenticationError")
 
 
+@pytest.mark.slow
 def test_who_has_the_token_can_join(running):
     """Otherwise the tests beside this one would pass for another reason than the token."""
     address, path = running
     assert join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN_PATH=str(path)) == "joined\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
 def test_another_user_can_neither_read_the_token_nor_join(running):
     address, path = running
@@ -150,51 +154,3 @@ def test_a_token_in_the_environment_needs_no_file(token_file, monkeypatch):
     token_file.chmod(0o644)
     monkeypatch.setenv("RAY_AUTH_TOKEN", "a" * 64)
     check_token_of_cluster("there:1")
-
-
-def test_folders_of_killed_runs_go_and_those_in_use_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 1000)
-    left = tmp_path / f"{PREFIX}abcdefgh"
-    left.mkdir()
-    other = tmp_path / f"{PREFIX}is_a_file"[: len(left.name)]
-    other.touch()
-    with private_folder() as first:
-        remove_private_folders()
-        assert (left.exists(), other.exists(), first.is_dir()) == (False, True, True)
-        with private_folder() as second:
-            assert first != second
-        assert not second.exists()
-    assert not first.exists()
-
-
-def test_a_folder_that_another_run_deletes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 1000)
-    make, made = tempfile.mkdtemp, []
-
-    def deleted_the_first_time(**where):
-        made.append(make(**where))
-        if len(made) == 1:
-            remove_private_folders()
-        return made[-1]
-
-    monkeypatch.setattr(tempfile, "mkdtemp", deleted_the_first_time)
-    with private_folder() as folder:
-        assert [str(folder)] == made[1:]
-        assert folder.is_dir()
-
-
-def test_a_long_place_for_temporary_files_is_passed_over(tmp_path, monkeypatch):
-    long = tmp_path / ("x" * 100)
-    long.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(long))
-    with private_folder() as folder:
-        assert long not in folder.parents
-
-
-def test_no_place_for_temporary_files_is_one_line_that_names_the_variable(monkeypatch):
-    monkeypatch.setattr("cconv.study.running.private_ray.LONGEST_SOCKET", 20)
-    with pytest.raises(ConfigError, match="bytes too long.*set TMPDIR") as caught, private_folder():
-        pass
-    assert "\n" not in str(caught.value)

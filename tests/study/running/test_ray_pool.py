@@ -1,63 +1,29 @@
 """What the pool makes of trainings that fail, hang, die, take too long or fill the disk; the others go on."""
 
-import errno
-import json
-import os
 import signal
 import subprocess
 import sys
-import time
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 import ray
-from conftest import SMOKE
+import troubles
 from processes import PATIENCE
+from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, troubled_problem
 
 from cconv.errors import ConfigError
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
 from cconv.study.running.ray_pool import STARTS, RayPool, _start, ray_pool
-from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
-from cconv.study.studies import load_study
+from cconv.study.running.trial_queue import NothingStops, TrialQueue
 
-FULL = 2
-ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers know no tests
+pytestmark = pytest.mark.integration
 
-
-@dataclass(frozen=True, kw_only=True)
-class TroubledProblem(Problem):
-    """A problem whose models bring trouble that the number of their initial weights names."""
-
-    def build_model(self, network, init_seed):
-        troubles = {1: self.error, 2: self.full_disk, 3: self.death, 4: self.hang}
-        troubles.get(init_seed, int)()
-        return super().build_model(network, init_seed)
-
-    def error(self):
-        raise ValueError("no such model")
-
-    def full_disk(self):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "log.jsonl")
-
-    def death(self):
-        os._exit(1)
-
-    def hang(self):
-        time.sleep(1000)
-
-
-def study_of(flow_folder, *settings):
-    overrides = [f"training.updates={FULL}", "training.evaluate_every=1", "search.grace_updates=1", *settings]
-    return with_data_path(load_study(SMOKE, [*overrides, "search.concurrency=2"]), str(flow_folder))
+ray.cloudpickle.register_pickle_by_value(troubles)  # workers know no tests
 
 
 @pytest.fixture(scope="module")
 def problem(flow_folder):
-    study = study_of(flow_folder)
-    known = load_problem(study, open_study_data(study.data, study.seeds.data))
-    return TroubledProblem(**vars(known))
+    return troubled_problem(flow_folder)
 
 
 @pytest.fixture(scope="module")
@@ -72,21 +38,12 @@ def train(cores, problem, flow_folder, tmp_path):
     """Train models of some initial weights with some settings; gives how each ended and why."""
 
     def run(seeds, *settings, judge=None):
-        jobs = [
-            Job(folder=tmp_path / f"trial_{seed}", name=f"trial_{seed}", parameters={}, init_seed=seed)
-            for seed in seeds
-        ]
         study = study_of(flow_folder, *settings)
-        queue = TrialQueue(jobs, FULL, judge or NothingStops(), [])
+        queue = TrialQueue(jobs_in(tmp_path, seeds), FULL, judge or NothingStops(), [])
         RayPool(study, problem, tmp_path / "ray").run(queue, "random", study.training)
         return {seed: end_of(tmp_path, seed) for seed in seeds}
 
     return run
-
-
-def end_of(folder, seed):
-    end = json.loads((folder / f"trial_{seed}" / "outcome.json").read_text())
-    return end["outcome"], end["reason"]
 
 
 def test_one_that_fails_is_recorded_with_its_reason_and_others_go_to_the_full_budget(train, tmp_path):
@@ -97,6 +54,7 @@ def test_one_that_fails_is_recorded_with_its_reason_and_others_go_to_the_full_bu
         assert {path.name for path in folder.iterdir()} == {"config.json", "log.jsonl", "outcome.json", "checkpoint"}
 
 
+@pytest.mark.slow
 def test_one_whose_process_dies_is_given_up_and_one_that_hangs_is_ended_at_its_limit(train, tmp_path):
     ends = train([3, 4, 0], "search.trial_seconds=15")
     assert ends[0] == ("completed", "")
@@ -107,6 +65,7 @@ def test_one_whose_process_dies_is_given_up_and_one_that_hangs_is_ended_at_its_l
     assert "in hang" in (tmp_path / "trial_4" / "hanging.txt").read_text()
 
 
+@pytest.mark.slow
 def test_one_that_takes_too_long_is_stopped_and_the_record_names_the_limit(train):
     endless = [f"{key}=1000000" for key in ("training.updates", "training.evaluate_every", "search.grace_updates")]
     reason = "it trained longer than its limit of 10 seconds"
@@ -121,12 +80,8 @@ def test_a_full_disk_ends_the_run_in_one_line_and_gives_no_training_an_outcome(t
 
 
 def test_an_error_of_the_judge_ends_the_run_as_it_is_and_gives_no_training_an_outcome(train, tmp_path):
-    class Broken:
-        def goes_on(self, name, entry):
-            raise OSError(errno.ENOSPC, "rungs.json")
-
     with pytest.raises(OSError, match="rungs.json"):
-        train([0], judge=Broken())
+        train([0], judge=BrokenJudge())
     assert not TrialFolder(tmp_path / "trial_0").ended
 
 

@@ -151,6 +151,7 @@ def test_proposals_are_whole_affordable_and_repeatable():
     assert proposals[0] != suggest(records, 0, seed=1, affordable=affordable)
 
 
+@pytest.mark.integration
 def test_a_fresh_process_proposes_the_same_without_torch_or_ray():
     script = """
 import json, sys

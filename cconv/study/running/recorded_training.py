@@ -1,0 +1,94 @@
+"""One job of a queue trained in this process, whatever happens to it: what every pool does with each."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from cconv.errors import ConfigError, is_disk_full
+from cconv.study.declared.study_file import StudyConfig, TrainingConfig
+from cconv.study.records.trials import TrialFolder
+from cconv.study.running.attempt import Attempt
+from cconv.study.running.problem import Problem, provenance
+from cconv.study.running.trial import run_trial
+from cconv.study.running.trial_queue import Job
+from cconv.training.loop import TrainingState
+
+HANGING = 2.0  # times its limit after which a training's process is ended from outside
+DISK_FULL = "disk full"
+
+
+class Report(NamedTuple):
+    """What a training has to say.
+
+    Attributes:
+        entry: Its last evaluation; zero updates before the first.
+        outcome: How it ended, where the training itself knows: "failed", "stopped" at its limit of time, or
+            `DISK_FULL`. None after an evaluation.
+        reason: Why, for a reader of the records.
+    """
+
+    entry: dict
+    outcome: str | None = None
+    reason: str = ""
+
+
+def train_recorded(
+    job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem
+) -> Iterator[Report]:
+    """Train a job; reports every evaluation, then how it ended if the training itself knows.
+
+    An error of the training is an outcome of the job, not an exception. A training that hangs ends this process.
+    """
+    limit = _seconds_limit(study, training)
+    last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
+    outcome, reason = None, ""
+    try:
+        with Attempt(job.folder, HANGING * limit) as attempt:
+            for last in _trial(job, stage, training, study, problem, attempt):
+                yield Report(last)
+        if not last["diverged"] and last["updates"] < training.updates:
+            outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
+    except Exception as error:
+        outcome, reason = DISK_FULL if is_disk_full(error) else "failed", str(error) or type(error).__name__
+    if outcome is not None:
+        _record_what_failed(job, stage, outcome)
+        yield Report(last, outcome, reason)
+
+
+def disk_is_full(job: Job, reason: str) -> ConfigError:
+    """The error that ends a run in which a training found the disk full."""
+    return ConfigError(f"{job.folder}: {reason}; make room, then `cconv study resume`.")
+
+
+def _seconds_limit(study: StudyConfig, training: TrainingConfig) -> float:
+    """Time that a training may take: the limit of a trial, and more in proportion for a budget beyond a trial's."""
+    return study.search.trial_seconds * max(1.0, training.updates / study.training.updates)
+
+
+def _trial(
+    job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem, attempt: Attempt
+) -> Iterator[dict]:
+    def check_before_writing(state: TrainingState) -> None:
+        if state.valid_normalized_mse is not None or state.diverged:
+            attempt.check()
+
+    folder = TrialFolder(job.folder)
+    yield from folder.log()[-1:]  # an earlier attempt may have died before it was judged
+    yield from run_trial(
+        problem,
+        job.parameters,
+        study.configuration._replace(training=training),
+        folder,
+        stage=stage,
+        init_seed=job.init_seed,
+        data_seed=study.seeds.data,
+        provenance=provenance(study),
+        seconds_limit=_seconds_limit(study, training),
+        on_update=check_before_writing,
+    )
+
+
+def _record_what_failed(job: Job, stage: str, outcome: str) -> None:
+    folder = TrialFolder(job.folder)
+    if outcome == "failed" and not folder.started:  # it failed before it could say what it is
+        known = {"stage": stage, "parameters": job.parameters, "init_seed": job.init_seed}
+        folder.start(known | {"num_parameters": None, "flops_per_particle": None})
