@@ -6,9 +6,12 @@ import re
 import stat
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+
+from filelock import FileLock
 
 from cconv.errors import CConvError, ConfigError, DataError, shown
 
@@ -130,10 +133,33 @@ def write_json(path: Path, value) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file under a temporary name, then rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}-{os.getpid()}")
-    try:
+    with replacing(path) as part:
         part.write_text(text)
-        os.replace(part, path)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path`, renamed to it when all is written, removed if anything fails."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
+    try:
+        yield part
+        part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Hold a lock file alone; the system lets go of it even if the process is killed.
+
+    Raises:
+        filelock.Timeout: If another process holds it.
+        OSError: If it cannot be locked.
+    """
+    lock = FileLock(path)
+    lock.acquire(blocking=False)
+    try:
+        yield
+    finally:
+        lock.release()

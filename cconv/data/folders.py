@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cconv.errors import ConfigError
+from cconv.files import replacing
 
 
 @contextmanager
@@ -17,15 +18,11 @@ def whole_file(file: Path) -> Iterator[Path]:
     Raises:
         ConfigError: If the file cannot be written.
     """
-    partial = file.with_name(f".{file.stem}.{os.getpid()}.partial{file.suffix}")
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(file)
+        with replacing(file) as part:
+            yield part
     except OSError as error:
         raise ConfigError(f"{file}: cannot be written ({error.strerror or error}); name another file.") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

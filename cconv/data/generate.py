@@ -4,7 +4,6 @@ Finished trajectories wait in a folder beside the one to write until all are the
 on where it stopped.
 """
 
-import fcntl
 import hashlib
 import json
 import os
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from filelock import Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
@@ -29,6 +29,7 @@ from cconv.data.source import SPLITS, STORED
 from cconv.data.splits import share_out, split_in_time
 from cconv.data.trajectory import Boundary, Scene, Trajectory
 from cconv.errors import ConfigError, DataError
+from cconv.files import held
 from cconv.scenes.simulated_scene import SimulatedScene
 
 Progress = Callable[[Iterable, str], Iterable]
@@ -189,11 +190,10 @@ def _unfinished_folder(unfinished: Path, request: dict, overwrite: bool) -> Iter
     """
     try:
         unfinished.mkdir(parents=True, exist_ok=True)
-        with (unfinished / _LOCK).open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # ends with the process, however that ends
+        with held(unfinished / _LOCK):
             _prepare(unfinished, request, overwrite)
             yield
-    except BlockingIOError as error:
+    except Timeout as error:
         raise ConfigError(f"{unfinished}: another process works on it; wait for it or name another folder.") from error
     except OSError as error:
         raise ConfigError(f"{unfinished}: cannot be used ({error.strerror or error}); name another folder.") from error

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
+from cconv.files import write_text
 from cconv.report.decidable import decidable
 from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
@@ -43,9 +43,7 @@ def write_report(run: RunFolder) -> Path:
         Path of the report.
     """
     path = run.path / "report.html"
-    temporary = path.with_suffix(".html.part")
-    temporary.write_text(render_report(run))
-    os.replace(temporary, path)
+    write_text(path, render_report(run))
     return path
 
 

@@ -1,7 +1,6 @@
 """Where a training stands, on disk, so that it goes on after a kill as if nothing had happened."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from cconv.errors import DataError
-from cconv.files import parse_json
+from cconv.files import parse_json, replacing
 from cconv.models.model import Model
 from cconv.validation import Real, StrictModel, Whole
 
@@ -43,17 +42,13 @@ def begin(model: Model) -> Progress:
 
 def save_progress(path: Path, model: Model, progress: Progress) -> None:
     """Write weights, Adam's moments and counts to one safetensors file, whole or not at all."""
-    part = path.with_name(f".{path.name}-{os.getpid()}")
     counts = {"updates": progress.updates, "seconds": progress.seconds}
     tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
     for name, parameter in model.named_parameters():
         moments = progress.optimizer.state.get(parameter, {})
         tensors |= {f"adam.{key}.{name}": value for key, value in moments.items()}
-    try:
+    with replacing(path) as part:
         save_file({name: value.contiguous() for name, value in tensors.items()}, part, {"counts": json.dumps(counts)})
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def load_progress(path: Path, model: Model) -> Progress:

@@ -1,21 +1,22 @@
 """The run folder: our own records of a study. Ray's files are disposable, these are the truth."""
 
-import fcntl
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from filelock import Timeout
+
 from cconv.errors import ConfigError, DataError, shown
-from cconv.files import write_json
+from cconv.files import held, write_json
 from cconv.study.records.forms import FORMS, Result, Table, read_record
 from cconv.study.records.trials import KNOWN_BEFORE, TrialFolder, TrialRecord
 from cconv.validation import Id, check_setting
 
 FORMAT = 3  # of a run folder; another one is refused
 
-_PART = re.compile(r"\..+-\d+")  # names of what is being written, which a kill leaves behind
+_PART = re.compile(r"\..+-\d+(\.[a-z]+)?")  # names of what is being written, which a kill leaves behind
 _FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json
 
 
@@ -86,16 +87,17 @@ class RunFolder:
         Raises:
             ConfigError: If another run works in the folder.
         """
-        with (self.path / "run.lock").open("w") as file:
+        lock = self.path / "run.lock"
+        with ExitStack() as stack:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
+                stack.enter_context(held(lock))
+            except Timeout as error:
                 raise ConfigError(
                     f"{self.path}: another run works in this folder; wait for it (`cconv study status`) or stop it."
                 ) from error
             except OSError as error:
                 raise ConfigError(
-                    f"{file.name}: cannot be locked ({error.strerror}); put the run folder on a file system with locks."
+                    f"{lock}: cannot be locked ({error.strerror}); put the run folder on a file system with locks."
                 ) from error
             yield
 
