@@ -160,17 +160,18 @@ def evaluate(
 
 def _errors_on(model, progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
     """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
-    from cconv.evaluation import metrics
+    from cconv.evaluation.metrics import own_variance, per_frame_normalized_mse
+    from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 
-    frames = metrics.frame_errors(model, progress)
-    mse, variance = metrics.normalized_mse(frames), metrics.own_variance(model, samples)
-    mean = None if training is None else metrics.normalized_mse(metrics.mean_predictor_error(samples, training))
+    frames = frame_errors(model, progress)
+    mse, variance = normalized_mse(frames), own_variance(model, samples)
+    mean = None if training is None else normalized_mse(mean_predictor_error(samples, training))
     return {
         "normalized_mse": mse,
         "relative_rmse": mse**0.5,
         "own_normalized_mse": mse / variance if variance > 0 else None,
         "mean_predictor_normalized_mse": mean,
-        "per_frame_normalized_mse": metrics.per_frame_normalized_mse(frames),
+        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
     }
 
 
