@@ -19,12 +19,13 @@ from cconv.evaluation.cost import ANALYTIC
 def run(script, *arguments):
     """What a script of experiments/benchmarks prints."""
     command = [sys.executable, BENCHMARKS / f"{script}.py", "--smoke", *arguments]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=2 * PATIENCE)
     assert finished.returncode == 0, finished.stderr
     return finished.stdout
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
 def test_the_benchmark_of_layers_measures_compares_and_draws(tmp_path):
     printed = run("continuous_conv", "--out", tmp_path)
     for what in ("the same: ours / matrix products", "geometry of 100,000 edges / layer", "extra memory"):
@@ -52,6 +53,7 @@ def dam_break(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
 def test_the_benchmark_of_predictions_compares_two_states_measures_growth_and_draws(dam_break, tmp_path):
     out = tmp_path / "out"
     run("inference", "--data", dam_break, "--before", Path(__file__).parents[1], "--out", out)

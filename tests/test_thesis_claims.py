@@ -10,6 +10,8 @@ import pytest
 
 from cconv.errors import DataError
 
+pytestmark = pytest.mark.integration
+
 SCRIPT = Path(__file__).parents[1] / "experiments" / "thesis_claims.py"
 WORDS = {
     "coordinate_mapping": ["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"],

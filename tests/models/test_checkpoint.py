@@ -138,6 +138,7 @@ def test_weights_that_are_not_those_of_the_settings_are_named(saved, changes, me
         load_model(saved[2])
 
 
+@pytest.mark.integration
 def test_a_huge_network_is_refused_before_anything_is_allocated(saved):
     path = saved[2] / "config.json"
     config = json.loads(path.read_text())

@@ -14,6 +14,8 @@ from cconv.report.fields import read_explanations
 from cconv.report.page import render_report
 from cconv.study.records.run_folder import RunFolder
 
+pytestmark = pytest.mark.integration
+
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 HOSTILE = "</script></style><img src=x onerror=evil()><script>evil()</script>\"'&"
 

@@ -14,6 +14,8 @@ from cconv.data.quantities import speed
 from cconv.errors import ConfigError
 from cconv.report.particles import COLORINGS, PICTURE_DPI, frames_chart, write_animation, write_picture
 
+pytestmark = pytest.mark.integration
+
 
 def discs(axes):
     (collection,) = (artist for artist in axes.collections if isinstance(artist, EllipseCollection))

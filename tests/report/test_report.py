@@ -13,6 +13,8 @@ from cconv.report import page
 from cconv.report.page import render_report, write_report
 from cconv.study.records.run_folder import RunFolder
 
+pytestmark = pytest.mark.integration
+
 SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 OPTIONAL = (
     "search_points", "analytic", "front", "growth", "rung_audit", "references", "importance", "ablation", "selection",
