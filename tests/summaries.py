@@ -48,7 +48,7 @@ def whole_summary(summary: dict) -> dict:
         "branches": [
             {"left_out": "dense", "normalized_mse": 0.004, "ms_per_frame": 3.9, "ratio": 4.21},
             {
-                "left_out": "boundary",
+                "left_out": "walls",
                 "valid_normalized_mse": 0.002,
                 "of": 0.001,
                 "flops_per_particle": 900.0,

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 from conftest import SMOKE
 
-from cconv.study.declared.study_file import StudyConfig, load_study
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
 from cconv.study.running.trial_queue import Job
+from cconv.study.studies import load_study
 
 FULL = 2
 

@@ -11,6 +11,7 @@ from cconv.evaluation.explanation import error_distribution, explain, first_laye
 from cconv.models.closed_form import solve_closed_form
 from cconv.study.declared.configuration import configure
 from cconv.tasks import task_named
+from cconv.tasks.features import Features
 from cconv.tasks.samples import make_sample
 
 SIDE = 12
@@ -62,10 +63,10 @@ def test_analytic_filters_are_the_printed_formulas(generator):
         line = torch.from_numpy(filters["line"])
         gradient = sign * mass * (kernel(scene).derivative(line.abs()) * line.sign()).numpy()
         if task == "density_gradient":
-            gradient = gradient / float(samples[0].inputs.features[:, -1].mean())
+            gradient = gradient / float(samples[0].inputs.features.scalars[:, 1].mean())
         for axis in range(2):
             along = filters["analytic_on_axes"][axis]
-            found = along[:, 1 + axis, 0] if task == "density_rate" else along[:, -1, axis]
+            found = along[:, 2 + axis, 0] if task == "density_rate" else along[:, 1, axis]
             np.testing.assert_allclose(found, gradient, rtol=1e-5, atol=1e-5 * abs(gradient).max())
             assert np.count_nonzero(np.abs(along).max(axis=(0, 2)) > 1e-9) == 1
 
@@ -122,10 +123,11 @@ def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(genera
 def test_models_without_density_or_with_walls_are_explained(generator):
     samples = samples_of(generator, "density_rate", 1)
     filters = first_layer_filters(built(configure({"density": False}, RADIAL), samples), samples[0])
-    assert abs(filters["learned_on_axes"][:, :, -1]).max() == 0
+    assert abs(filters["learned_on_axes"][:, :, 1]).max() == 0
+    ones = Features(scalars=torch.ones(7, 1), vectors=torch.zeros(7, 0, 2), scalar_names=("one",), vector_names=())
     walled = replace(
         samples[0],
-        inputs=replace(samples[0].inputs, boundary_positions=torch.rand(7, 2), boundary_features=torch.ones(7, 1)),
+        inputs=replace(samples[0].inputs, wall_positions=torch.rand(7, 2), wall_features=ones),
     )
     model = built(GRID, [walled])
     assert explain(model, walled)["prediction"].shape == (SIDE**2, 1)

@@ -83,7 +83,7 @@ def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
         "loses good trials",
         "less accurate than the",
         "dense left out",
-        "boundary added",
+        "walls added",
         "density left out",
     ):
         assert figure in whole_report

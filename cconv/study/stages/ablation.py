@@ -12,8 +12,6 @@ from pydantic import Field
 
 from cconv.study.declared.configuration import configure
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
-from cconv.study.evidence.ablation_path import ablation_order, path_configurations
-from cconv.study.evidence.surrogate import FEWEST_TRIALS
 from cconv.study.stages.closed_form import fit_whole
 from cconv.study.stages.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
 from cconv.study.stages.jobs import train_all
@@ -88,6 +86,8 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
     The order comes from a surrogate of the errors at the highest rung that enough trials reached; none where the study
     is too small for that.
     """
+    from cconv.study.evidence.ablation_path import ablation_order, path_configurations  # scikit-learn: no reader of a
+    from cconv.study.evidence.surrogate import FEWEST_TRIALS  # study file shall wait for it
 
     best, baseline = min(found, key=_mean_error).records[0].parameters, session.space.baseline
     known = session.read(stage, "initialization", "random")

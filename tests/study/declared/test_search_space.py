@@ -138,7 +138,7 @@ def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
     assert space.parameters["layers"].values == [1]
     assert "window" not in space.parameters
     assert space.baseline == conditional_space().baseline
-    assert fixed(space, "boundary") == space
+    assert fixed(space, "walls") == space
 
 
 def test_single_layers_hold_what_is_active_in_one():
@@ -160,7 +160,7 @@ def test_single_layers_of_the_density_space_are_distinct_configurations_with_all
     layers = single_layers(space, DEFAULTS.network, 2)
     assert len({repr(sorted(layer.items())) for layer in layers}) == len(layers)
     assert all(space.holds(layer | {"learning_rate": 1e-3}) for layer in layers)
-    assert {(layer["boundary"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
+    assert {(layer["walls"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
 
 
 def test_a_baseline_above_the_cap_is_refused():

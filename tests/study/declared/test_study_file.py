@@ -208,12 +208,12 @@ def test_what_is_no_regular_file_is_refused_without_reading_it(tmp_path):
 )
 def test_a_task_or_network_that_is_none_is_named(study_file, override, message):
     with pytest.raises(ConfigError, match=message) as error:
-        load_study(study_file(""), [override])
+        load_study(study_file(MINIMAL), [override])
     assert "\n" not in str(error.value)
 
 
 def test_a_task_is_given_by_name_or_as_a_table(study_file):
-    path = study_file("")
+    path = study_file(MINIMAL)
     assert load_study(path).task.taken == ("one", "density", "velocity", "walls")
     study = load_study(path, ['task.features=["velocity"]', "network.architecture=radial_net"])
     assert study.task.taken == ("one", "velocity")

@@ -97,7 +97,7 @@ def test_trainings_compute_on_one_thread_as_those_of_ray_do_and_threads_are_rest
     try:
         study = study_of(flow_folder)
         queue = TrialQueue(jobs_in(tmp_path, [0]), FULL, Watching(), [])
-        SerialPool(study, sound_problem(generator, study.task)).run(queue, "random", study.training)
+        SerialPool(study, sound_problem(generator, study.task.name)).run(queue, "random", study.training)
         assert (seen, torch.get_num_threads()) == ([1, 1], 2)
     finally:
         torch.set_num_threads(before)

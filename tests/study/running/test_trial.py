@@ -15,7 +15,7 @@ TRAINING = TrainingConfig(updates=6, evaluate_every=2)
 def trial(given, folder, parameters=None, **options):
     return run_trial(
         given, parameters or {}, NETWORK._replace(training=TRAINING), folder,
-        stage="random", init_seed=1, data_seed=0, provenance={"task": given.task}, **options,
+        stage="random", init_seed=1, data_seed=0, provenance={"task": given.task.name}, **options,
     )  # fmt: skip
 
 

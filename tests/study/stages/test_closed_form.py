@@ -143,10 +143,10 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
 @pytest.mark.parametrize(
     ("errors", "kept"),
     [
-        ({"boundary density": 1.0, "density": 1.04, "": 1.08}, ""),  # each within the margin of the one before
-        ({"boundary density": 1.0, "density": 1.06, "boundary": 0.5}, "boundary"),
-        ({"boundary density": 1.0, "density": 0.9, "": 0.96}, "density"),
-        ({"boundary density": 1.0, "density": 1.06, "boundary": 1.06}, "boundary density"),
+        ({"walls density": 1.0, "density": 1.04, "": 1.08}, ""),  # each within the margin of the one before
+        ({"walls density": 1.0, "density": 1.06, "walls": 0.5}, "walls"),
+        ({"walls density": 1.0, "density": 0.9, "": 0.96}, "density"),
+        ({"walls density": 1.0, "density": 1.06, "walls": 1.06}, "walls density"),
     ],
 )
 def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept, tmp_path, monkeypatch):
@@ -156,7 +156,7 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
         folder.append({"updates": 0, "valid_normalized_mse": error, "seconds": 1.0})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
-    space = space_of(boundary=[True, False], density=[True, False])
+    space = space_of(walls=[True, False], density=[True, False])
     study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True, "density": True})
@@ -174,7 +174,7 @@ def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkey
         folder.start({"stage": stage, "parameters": parameters})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
-    session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(boundary=[True]))
+    session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(walls=[True]))
     candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True})
     assert without_unneeded_features(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
     assert fitted == [candidate.parameters]
