@@ -5,11 +5,13 @@ import json
 import optuna
 import pytest
 import torch
+from studies import Silent, begin_search
 
 from cconv import load_model, open_dataset
 from cconv.models.errors import frame_errors, normalized_mse
 from cconv.study.declared.domains import SearchSpace, fixed
 from cconv.study.declared.search_space import load_space
+from cconv.study.pipeline import run_study
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.optuna_mirror import open_storage
 from cconv.tasks.samples import iterate_samples
@@ -231,11 +233,8 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(cconv, flow_fold
     (tmp_path / "space.toml").write_text(SPACE_WITH_FAILURES)
     (tmp_path / "failures.toml").write_text(STUDY_WITH_FAILURES.format(space=tmp_path / "space.toml"))
     folder = tmp_path / "run"
-    status, _, error = cconv(
-        "study", "run", tmp_path / "failures.toml", "--serial", "--data", flow_folder, "--out", folder
-    )
-    assert status == 0, error
-    run = RunFolder.open(folder)
+    run = begin_search(tmp_path / "failures.toml", flow_folder, folder)
+    run_study(run, Silent(), serial=True)
     failed = [record for record in run.trials() if record.outcome == "failed"]
     assert {record.parameters["relative_cutoff"] for record in failed} == {6.0}
     assert all("half of every periodic axis" in record.reason for record in failed)
