@@ -15,6 +15,12 @@ from cconv import load_model
 from cconv.study.records.run_folder import RunFolder
 
 
+@pytest.fixture
+def own_run(finished_run, tmp_path):
+    """A copy of the finished run that a test may lock and write to, while others read the run itself."""
+    return shutil.copytree(finished_run, tmp_path / "own")
+
+
 def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):
     summary = json.loads((finished_run / "summary.json").read_text())
     for entry in summary["finalists"]:
@@ -25,15 +31,15 @@ def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):
         assert json.loads(out)["normalized_mse"] == pytest.approx(reported, rel=1e-6)
 
 
-def test_status_and_report_of_a_finished_run(cconv, finished_run):
-    status, out, _ = cconv("study", "status", finished_run, "--json")
+def test_status_and_report_of_a_finished_run(cconv, own_run):
+    status, out, _ = cconv("study", "status", own_run, "--json")
     facts = json.loads(out)
     assert status == 0
     assert facts["state"] == "finished"
     assert facts["best"]["valid_normalized_mse"] > 0
-    status, out, _ = cconv("study", "status", finished_run)
+    status, out, _ = cconv("study", "status", own_run)
     assert "finished" in out
-    status, out, _ = cconv("report", finished_run)
+    status, out, _ = cconv("report", own_run)
     assert (status, "report.html" in out) == (0, True)
 
 
@@ -220,26 +226,26 @@ def test_ctrl_c_leaves_a_usable_checkpoint_of_a_training(flow_folder, tmp_path):
     shutil.rmtree(folder)
 
 
-def test_a_second_run_on_the_same_folder_is_refused(cconv, finished_run):
-    before = (finished_run / "state.json").read_bytes()
-    with RunFolder(finished_run).locked():
-        assert_one_clear_line(cconv("study", "resume", finished_run), "another run works in this folder")
-        extend = ("study", "extend", finished_run, "--stage", "random", "--trials", "2")
+def test_a_second_run_on_the_same_folder_is_refused(cconv, own_run):
+    before = (own_run / "state.json").read_bytes()
+    with RunFolder(own_run).locked():
+        assert_one_clear_line(cconv("study", "resume", own_run), "another run works in this folder")
+        extend = ("study", "extend", own_run, "--stage", "random", "--trials", "2")
         assert_one_clear_line(cconv(*extend), "another run works in this folder")
-    assert (finished_run / "state.json").read_bytes() == before
+    assert (own_run / "state.json").read_bytes() == before
 
 
-def test_only_a_search_can_be_extended(cconv, finished_run):
-    extend = ("study", "extend", finished_run, "--stage", "finalists", "--trials", "2")
+def test_only_a_search_can_be_extended(cconv, own_run):
+    extend = ("study", "extend", own_run, "--stage", "finalists", "--trials", "2")
     assert_one_clear_line(cconv(*extend), "no search 'finalists' to extend", "random, adaptive")
 
 
-def test_a_finished_study_has_nothing_left_to_resume(cconv, finished_run):
-    before = (finished_run / "rungs.json").read_bytes()
-    status, out, _ = cconv("study", "resume", finished_run)
+def test_a_finished_study_has_nothing_left_to_resume(cconv, own_run):
+    before = (own_run / "rungs.json").read_bytes()
+    status, out, _ = cconv("study", "resume", own_run)
     assert status == 0
     assert "Study finished" in out
-    assert (finished_run / "rungs.json").read_bytes() == before
+    assert (own_run / "rungs.json").read_bytes() == before
 
 
 def test_a_run_of_another_version_is_refused_and_left_alone(cconv, finished_run, tmp_path):

@@ -35,10 +35,13 @@ def radial(points, message, outputs=(2, 1)):
 @pytest.mark.parametrize("message", ["absolute", "difference"])
 @pytest.mark.parametrize("make", [grid, radial])
 def test_terms_times_coefficients_are_the_network(make, message, points, generator):
-    """Coefficients found from a network's own outputs give back its outputs."""
+    """Coefficients found from a network's own outputs give back its outputs, what its biases add included."""
     build, (fluid, walls) = make(points, message)
     inputs = normal(generator, 80, 4), fluid, normal(generator, 30, 2), walls
     teacher, student = build(generator), build(generator)
+    for name, parameter in teacher.named_parameters():
+        if name.endswith("bias"):
+            torch.nn.init.normal_(parameter, generator=generator)
     target = teacher(*inputs).detach()
     layer = student.linear_terms()
     assert not torch.allclose(student(*inputs), target)
