@@ -2,6 +2,7 @@ import itertools
 import json
 import os
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -112,6 +113,13 @@ def test_a_checkpoint_of_another_format_is_refused_with_the_way_out(saved, versi
         ConfigError, match=r"config\.json: `format` is .*, and this version reads 3.*fit the model again"
     ):
         load_model(saved[2])
+
+
+@pytest.mark.parametrize("architecture", ["grid", "radial"])
+def test_a_checkpoint_of_the_version_before_is_refused_with_the_way_out(architecture):
+    folder = Path(__file__).parents[1] / "data" / "models_format_2" / architecture
+    with pytest.raises(ConfigError, match="`format` is 2, and this version reads 3; train or fit the model again"):
+        load_model(folder)
 
 
 def with_weights(folder, **changes):
