@@ -6,7 +6,6 @@ on where it stopped.
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ from cconv import scenes, sph
 from cconv.data.folders import check_free
 from cconv.data.hdf5 import FILES, write_dataset
 from cconv.data.metadata import OWN_KEY
-from cconv.data.side_by_side import side_by_side
+from cconv.data.side_by_side import available_cores, side_by_side
 from cconv.data.simulate import Simulation, simulate
 from cconv.data.source import SPLITS, STORED
 from cconv.data.splits import share_out, split_in_time
@@ -91,7 +90,7 @@ def generate(
     with _unfinished_folder(unfinished, request, overwrite):
         files = [unfinished / f"{index:05d}{_SUFFIX}" for index in range(count)]
         calls = [(scene, frames, seed, index, file) for index, file in enumerate(files) if not _is_whole(file)]
-        workers = max(1, min(workers or len(os.sched_getaffinity(0)), len(calls)))
+        workers = max(1, min(workers or available_cores(), len(calls)))
         for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
             pass
         (unfinished / _WRITING).touch()  # what is in the folder from now on is ours

@@ -18,6 +18,11 @@ import torch
 from cconv.errors import DataError
 
 
+def available_cores() -> int:
+    """Cores that this process may use; all of the machine where the system does not tell."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def side_by_side(generator: Callable[..., Iterable], calls: Sequence[tuple], workers: int) -> Iterator[None]:
     """Run ``generator(*call)`` to its end for every call; yields whenever one of them yields.
 
@@ -31,7 +36,7 @@ def side_by_side(generator: Callable[..., Iterable], calls: Sequence[tuple], wor
         Exception: What a call raised.
     """
     context, waiting = multiprocessing.get_context("spawn"), iter(calls)
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    threads = max(1, available_cores() // workers)
     processes: list[SpawnProcess] = []
     busy: list[Connection] = []
     try:

@@ -16,7 +16,7 @@ from scipy.stats import hypergeom
 
 from cconv.files import write_text
 from cconv.study.declared.domains import Choice, FloatRange, IntRange, Parameter, SearchSpace, Value, narrowed
-from cconv.study.records.trials import TrialRecord
+from cconv.study.records.trials import TrialRecord, identity
 
 MIN_TRIALS = 20
 TOP_SHARE = 0.25
@@ -111,7 +111,7 @@ def _distinct(records: Sequence[TrialRecord]) -> list[TrialRecord]:
     """The first training of each configuration."""
     first: dict[str, TrialRecord] = {}
     for record in records:
-        first.setdefault(repr(sorted(record.parameters.items())), record)
+        first.setdefault(identity(record.parameters), record)
     return list(first.values())
 
 

@@ -15,7 +15,7 @@ from cconv.evaluation.statistics import (
     why_no_interval,
 )
 from cconv.study.evidence.front import Timing, pareto_front
-from cconv.study.records.trials import TrialRecord
+from cconv.study.records.trials import TrialRecord, identity
 
 SHOWN_FAILURES = 2  # of a model, in words
 RULES = ("one_standard_error", "non_inferiority", "accurate_enough")
@@ -38,7 +38,7 @@ def choose_finalists(
     distinct: dict[str, TrialRecord] = {}
     for record in records:
         if record.outcome == "completed" and record.last is not None:
-            distinct.setdefault(repr(sorted(record.parameters.items())), record)
+            distinct.setdefault(identity(record.parameters), record)
     by_id = {record.id: record for record in distinct.values()}
     errors = {trial: record.last["valid_normalized_mse"] for trial, record in by_id.items()}
     front = pareto_front({trial: (errors[trial], cost[trial]) for trial in by_id})[::-1]

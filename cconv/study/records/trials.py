@@ -153,6 +153,11 @@ class TrialFolder:
         )
 
 
+def identity(parameters: Mapping) -> str:
+    """What two configurations share only if their hyperparameters are the same."""
+    return repr(sorted(parameters.items()))
+
+
 def count_outcomes(records: Sequence[TrialRecord]) -> dict[str, dict[str, int]]:
     """Number of trials of each outcome, by stage."""
     stages = list(dict.fromkeys(record.stage for record in records))

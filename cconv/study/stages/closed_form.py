@@ -27,7 +27,7 @@ from cconv.study.declared.configuration import OPTIONAL_FEATURES, configure
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
 from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
-from cconv.study.records.trials import TrialFolder, TrialRecord
+from cconv.study.records.trials import TrialFolder, TrialRecord, identity
 from cconv.study.running.problem import Problem, provenance
 from cconv.study.running.trial import describe
 from cconv.study.stages.jobs import trial_name
@@ -65,12 +65,12 @@ class ClosedFormStage(Stage):
         """
         layers = single_layers(session.space, session.study.network, self.values_per_range)
         samples = self._screening_samples(session.problem)
-        untried = {layer_id(layer): layer for layer in layers}
+        untried = {identity(layer): layer for layer in layers}
         batch = _draw(layers, (self.max_candidates + 1) // 2, session.seed_of(name))
         number = 0
         while batch and number < self.max_candidates:
             for layer in batch:
-                del untried[layer_id(layer)]
+                del untried[identity(layer)]
             affordable = [layer for layer in batch if session.affordable(layer)][: self.max_candidates - number]
             for layer in session.progress(affordable, "closed forms"):
                 folder = session.run.trial(trial_name(name, number))
@@ -119,7 +119,7 @@ def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range
             "architecture": architecture,
             **{name: value for name, value in values.items() if name in applies},
         }
-        layers.setdefault(layer_id(layer), layer)
+        layers.setdefault(identity(layer), layer)
     return list(layers.values())
 
 
@@ -141,18 +141,13 @@ def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]])
     """
     with_other_terms = [layer for record in winners for layer in untried if _same_but_terms(record, layer)]
     if with_other_terms:
-        return list({layer_id(layer): layer for layer in with_other_terms}.values())
+        return list({identity(layer): layer for layer in with_other_terms}.values())
     return next(filter(None, (_neighbors(record.parameters, untried) for record in winners)), [])
 
 
 def _same_but_terms(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
     """Whether a layer differs from that of a record in the number of its basis functions alone."""
     return "radial_terms" in layer and record.parameters | {"radial_terms": layer["radial_terms"]} == layer
-
-
-def layer_id(layer: Mapping[str, Value]) -> str:
-    """What two layers share only if they are the same."""
-    return repr(sorted(layer.items()))
 
 
 def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
@@ -179,7 +174,7 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
         if isinstance(settings, ClosedFormStage):
             for record in session.progress(settings.winners(session, name), "closed-form finalists"):
                 finalist, parameters = without_unneeded_features(session, record, seed, settings.ridge)
-                chosen.setdefault(layer_id(parameters), (finalist, parameters))
+                chosen.setdefault(identity(parameters), (finalist, parameters))
     return dict(chosen.values())
 
 

@@ -11,11 +11,11 @@ from cconv.study.declared.configuration import DEFAULTS, OPTIONAL_FEATURES
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
+from cconv.study.records.trials import identity
 from cconv.study.stages import closed_form
 from cconv.study.stages.closed_form import (
     _draw,
     _neighbors,
-    layer_id,
     propose,
     single_layers,
     without_unneeded_features,
@@ -82,8 +82,8 @@ def changes(layer, other):
 
 
 def without(layers, tried):
-    known = {layer_id(layer) for layer in tried}
-    return [layer for layer in layers if layer_id(layer) not in known]
+    known = {identity(layer) for layer in tried}
+    return [layer for layer in layers if identity(layer) not in known]
 
 
 def winners_of(*layers):
@@ -95,7 +95,7 @@ def test_every_other_number_of_terms_of_every_winner_comes_first_and_once(winner
     untried = without(LAYERS, winners)
     proposed = propose(winners_of(*winners), untried)
     near = [layer for layer in RADIAL if any(changes(layer, winner) == {"radial_terms"} for winner in winners)]
-    assert sorted(map(layer_id, proposed)) == sorted(layer_id(layer) for layer in near if layer in untried)
+    assert sorted(map(identity, proposed)) == sorted(identity(layer) for layer in near if layer in untried)
 
 
 def test_then_come_the_layers_one_change_away_from_the_most_accurate_winner_that_has_any_left():
