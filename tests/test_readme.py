@@ -1,4 +1,4 @@
-"""The code blocks of the README run as they stand, on a small data set and a fitted model."""
+"""The code blocks of the README and of docs/ run as they stand, on a small data set and a fitted model."""
 
 import re
 from pathlib import Path
@@ -6,20 +6,28 @@ from pathlib import Path
 import cconv
 from cconv.models.checkpoint import save_model
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "docs" / "python.md"]
 CHECKPOINT = "runs/dpi_density_rate/finalists/baseline/seed_1/checkpoint"
 
 
-def test_the_code_blocks_of_the_readme_run(flow_folder, tmp_path):
+def test_the_code_blocks_run(flow_folder, tmp_path):
     save_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), tmp_path / "model", {})
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    blocks = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
     assert len(blocks) == 4
     code = "\n".join(blocks)
     for placeholder, path in {"FOLDER": flow_folder, CHECKPOINT: tmp_path / "model"}.items():
         assert f'"{placeholder}"' in code
         code = code.replace(f'"{placeholder}"', repr(str(path)))
     names = {}
-    exec(compile(code, str(README), "exec"), names)
+    exec(compile(code, "README.md", "exec"), names)
     assert names["features"].shape == (1000, 16)
     assert names["output"].shape == (1000, 1)
     assert names["frame"].positions.shape[1] == 2
+
+
+def test_every_local_link_of_the_pages_leads_somewhere():
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
