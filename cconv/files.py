@@ -139,7 +139,7 @@ def write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, renamed to it when all is written, removed if anything fails."""
+    """A temporary name for a file beside `path`, renamed to it when all is written, removed if anything fails."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
     try:
@@ -157,7 +157,7 @@ def held(path: Path) -> Iterator[None]:
         filelock.Timeout: If another process holds it.
         OSError: If it cannot be locked.
     """
-    lock = FileLock(path)
+    lock = FileLock(path, fallback_to_soft=False)  # which a kill would leave behind
     lock.acquire(blocking=False)
     try:
         yield

@@ -122,6 +122,8 @@ def _describe(model: type[BaseModel], values: object, problem: Mapping) -> str:
 
 def _sentence(problem: Mapping) -> str:
     message = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "union_tag_invalid":  # the tag stands in the message, whole
+        message = message.replace(f"'{problem['ctx']['tag']}'", shown(problem["ctx"]["tag"]))
     came = "" if isinstance(problem["input"], Mapping) else f", got {shown(problem['input'])}"
     return f"{message[0].lower()}{message[1:]}{came}."
 
@@ -146,11 +148,16 @@ def _known_keys(model: type[BaseModel], path: Iterable[str]) -> list[str]:
         for candidate in candidates:
             field = candidate.model_fields.get(part)
             inner.extend(_models_in(field.annotation) if field else [])
-            # A union's tag or a mapping's key stands in the path too: stay at the same models.
+            # A union's tag or a mapping's key stands in the path too: stay at the tagged model, or at the same ones.
             if not field:
                 inner.append(candidate)
-        candidates = inner
+        candidates = [each for each in inner if _is_tagged(each, part)] or inner
     return list(dict.fromkeys(name for candidate in candidates for name in candidate.model_fields))
+
+
+def _is_tagged(model: type[BaseModel], tag: str) -> bool:
+    """Whether a member of a union has this tag, as the default of one of its fields."""
+    return any(isinstance(field.default, str) and field.default == tag for field in model.model_fields.values())
 
 
 def _models_in(annotation) -> list[type[BaseModel]]:

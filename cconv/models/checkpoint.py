@@ -72,7 +72,7 @@ def load_model(path: Path | str, task: str | None = None) -> Model:
     for name in (WEIGHTS, CONFIG):
         if not (folder / name).is_file():
             raise ConfigError(
-                f"{folder}: no {name}; give a checkpoint folder, e.g. runs/<study>/finalists/<id>/seed_0."
+                f"{folder}: no {name}; give a checkpoint folder, e.g. runs/<study>/finalists/<id>/seed_1/checkpoint."
             )
     config = _read_config(folder / CONFIG)
     if task is not None and config.task != task:

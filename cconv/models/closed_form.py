@@ -84,7 +84,7 @@ def fit_closed_form(
         reach = asked.kernel_at(1.0, dataset.scene.dim).support_radius
         network = RadialNetSettings(layers=1, message="difference", relative_cutoff=reach)
     samples = list(iterate_samples(dataset, "train", asked))
-    model = build_model(network, asked, features or asked.features, dataset.scene, samples)
+    model = build_model(network, asked, asked.features if features is None else features, dataset.scene, samples)
     solve_closed_form(model, samples, ridge, progress)
     return model.eval()
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from cconv.data.trajectory import Frame, Scene
-from cconv.errors import ConfigError, ShapeError
+from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
 from cconv.neighbors import radius_graph
 from cconv.networks import NetworkTable
@@ -40,7 +40,7 @@ class ModelConfig(StrictModel):
     relative_smoothing_length: Length
     dim: Whole = Field(ge=1, le=3)
     particle_spacing: Length
-    features: tuple[str, ...]
+    features: tuple[str, ...] = Field(max_length=100)
     wall_scalars: Whole = Field(ge=0, le=1)
     wall_vectors: Whole = Field(ge=0, le=1)
     network: NetworkTable
@@ -49,10 +49,12 @@ class ModelConfig(StrictModel):
     def _names_are_known(self) -> "ModelConfig":
         for what, name, known in (("task", self.task, TASKS), ("kernel", self.kernel, KERNELS)):
             if name not in known:
-                raise ValueError(f"`{what}` must be one of {', '.join(known)}, got {name!r}")
-        known = TASKS[self.task].features
-        if CONSTANT not in self.features or not set(self.features) <= set(known):
-            raise ValueError(f"`features` must hold {CONSTANT!r} and others of {', '.join(known)}")
+                raise ValueError(f"`{what}` must be one of {', '.join(known)}, got {shown(name)}")
+        TASKS[self.task].check_features(self.features)
+        if (self.wall_scalars or self.wall_vectors) and WALLS not in self.features:
+            raise ValueError(f"a branch for walls needs the feature {WALLS!r}")
+        if self.wall_scalars and self.wall_vectors:
+            raise ValueError("wall points carry a scalar or a vector, not both")
         return self
 
     @property
@@ -221,11 +223,12 @@ def build_model(
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
-        ConfigError: If the network would be too large.
+        ConfigError: If the network would be too large, or a feature is unknown or missing.
     """
     given = train_samples[0].inputs
     walls = (given.wall_kinds if WALLS in features else None) or Kinds(0, 0)
     names = {CONSTANT, *features}
+    task.check_features(names)
     config = ModelConfig(
         task=task.name,
         kernel=task.kernel,

@@ -8,6 +8,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
+from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
@@ -43,6 +44,26 @@ class FieldTask(ABC):
     @abstractmethod
     def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
         """The field as a user computes it who wants it fast, from particles in float32; timed beside the networks."""
+
+    @classmethod
+    def check_features(cls, names: Collection[str]) -> None:
+        """Check that features are those of the task, each once, and that none is missing that no model does without.
+
+        Raises:
+            ConfigError: With the feature.
+        """
+        for name in names:
+            if name not in cls.features:
+                raise ConfigError(
+                    f"no feature {shown(name)}.{did_you_mean(name, cls.features)} Features: {', '.join(cls.features)}"
+                )
+        for name in cls.features:
+            if name not in names and name not in cls.optional:
+                raise ConfigError(
+                    f"the feature {name!r} must be one of `features`; optional are {', '.join(cls.optional)}"
+                )
+        if len(set(names)) < len(names):
+            raise ConfigError("`features` must hold each name once")
 
     def kernel_at(self, particle_spacing: float, dim: int) -> AbstractKernel:
         """SPH kernel in data of some particle spacing."""

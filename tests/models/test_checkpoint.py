@@ -122,6 +122,27 @@ def test_a_checkpoint_of_the_version_before_is_refused_with_the_way_out(architec
         load_model(folder)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"features": ["one"]}, "the feature 'velocity' must be one of `features`"),
+        ({"features": ["one", "one", "velocity"]}, "must hold each name once"),
+        ({"features": ["one", "velocity", "colour"]}, "no feature 'colour'"),
+        ({"wall_vectors": 1, "features": ["one", "velocity"]}, "a branch for walls needs the feature 'walls'"),
+        ({"wall_vectors": 1, "wall_scalars": 1}, "a scalar or a vector, not both"),
+        ({"task": "x" * 10**6}, "`task` must be one of density_rate, density_gradient"),
+        ({"network": {"architecture": "x" * 10**6}}, "expected tags: 'conv_net', 'radial_net'"),
+    ],
+)
+def test_settings_that_no_model_has_are_refused_in_one_short_line(saved, changes, message):
+    path = saved[2] / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(ConfigError, match=message) as error:
+        load_model(saved[2])
+    assert len(str(error.value)) < 1000
+    assert "\n" not in str(error.value)
+
+
 def with_weights(folder, **changes):
     """Write the weights again with other tensors; None takes one away."""
     path = folder / "model.safetensors"

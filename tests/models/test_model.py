@@ -8,6 +8,7 @@ from cconv.data.trajectory import Boundary
 from cconv.errors import ConfigError, ShapeError
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.closed_form import solve_closed_form
+from cconv.models.model import build_model
 from cconv.nn.kinds import Kinds
 from cconv.study.declared.configuration import configure
 from cconv.tasks import task_named
@@ -183,3 +184,11 @@ def test_a_switched_model_is_solved_saved_and_loaded(architecture, switches, gen
     save_model(model, tmp_path / "model", {})
     again = load_model(tmp_path / "model")
     assert torch.equal(again.predict_frame(frame, scene), model.predict_frame(frame, scene))
+
+
+@pytest.mark.parametrize("features", [["velocity", "denisty"], ["density"], []])
+def test_features_that_are_unknown_or_missing_are_named(features, generator):
+    scene, task = periodic_scene(), task_named("density_rate")
+    sample = make_sample(periodic_frame(generator), scene, task)
+    with pytest.raises(ConfigError, match="feature"):
+        build_model(SMALL.network, task, features, scene, [sample])

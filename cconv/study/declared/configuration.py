@@ -16,8 +16,10 @@ from cconv.validation import Length, Real, StrictModel, Value, Whole
 MOST_UPDATES = 10**9
 TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
-_NETWORK = tuple(dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields))
-HYPERPARAMETERS = (*_NETWORK, *OPTIONAL_FEATURES, *TRAINING_HYPERPARAMETERS)
+NETWORK_HYPERPARAMETERS = tuple(
+    dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
+)
+HYPERPARAMETERS = (*NETWORK_HYPERPARAMETERS, *OPTIONAL_FEATURES, *TRAINING_HYPERPARAMETERS)
 
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 
@@ -32,7 +34,7 @@ class TaskConfig(StrictModel):
     name: Literal[tuple(TASKS)]
     kernel: str = "cubic_spline"
     smoothing_length: Length | None = None
-    features: tuple[str, ...] | None = None
+    features: tuple[str, ...] | None = Field(None, max_length=100)
 
     @field_validator("kernel")
     @classmethod
@@ -43,17 +45,8 @@ class TaskConfig(StrictModel):
 
     @model_validator(mode="after")
     def _features_are_of_the_task(self) -> "TaskConfig":
-        known = TASKS[self.name].features
-        for name in self.features or ():
-            if name not in known:
-                raise ValueError(f"no feature {shown(name)};{did_you_mean(name, known)} features: {', '.join(known)}")
-        needed = [name for name in known if name not in (*TASKS[self.name].optional, CONSTANT)]
-        for name in needed if self.features is not None else ():
-            if name not in self.features:
-                raise ValueError(
-                    f"the feature `{name}` must be one of `features`; optional are "
-                    f"{', '.join(TASKS[self.name].optional)}"
-                )
+        if self.features is not None:
+            TASKS[self.name].check_features({CONSTANT, *self.features})
         return self
 
     @property
@@ -104,8 +97,8 @@ def check_known(parameters: Mapping[str, Value]) -> None:
 def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Configuration:
     """The drawn hyperparameters in place of the study's own.
 
-    An optional feature is named with whether it is taken. Settings of another architecture than the drawn one fall
-    away.
+    An optional feature is named with whether it is taken. Where another architecture than the study's is drawn, the
+    study's settings that it does not have fall away.
 
     Raises:
         ConfigError: If they are not possible together.
@@ -127,6 +120,8 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(map(str, problem["loc"])) or "together"
+        if problem["type"] == "extra_forbidden":
+            raise ConfigError(f"not possible ({where}: is no setting of {architecture})") from error
         raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
 
 

@@ -210,7 +210,7 @@ def narrowed(space: SearchSpace, domains: Mapping[str, Parameter]) -> SearchSpac
 
 
 def fixed(space: SearchSpace, name: str) -> SearchSpace:
-    """The space with one parameter held at its baseline, e.g. "boundary" in a scene without walls."""
+    """The space with one parameter held at its baseline, e.g. "walls" in a scene without walls."""
     if name not in space.parameters:
         return space
     parameter = space.parameters[name]

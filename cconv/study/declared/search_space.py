@@ -1,12 +1,20 @@
 """Search spaces: which hyperparameters vary, over what, when, and why. TOML, validated; see search_spaces/README.md."""
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.files import read_toml
+from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import CountedCost
-from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
+from cconv.study.declared.configuration import (
+    DEFAULTS,
+    HYPERPARAMETERS,
+    NETWORK_HYPERPARAMETERS,
+    Configuration,
+    configure,
+)
 from cconv.study.declared.domains import SearchSpace, Value
 from cconv.study.declared.study_file import StudyConfig
 from cconv.validation import validated
@@ -49,7 +57,22 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
         for value in parameter.extremes:
             values = space.making_active(name) | {name: value}
             _check_configures(values, defaults, f"{source}: `parameters.{name}`: the value {shown(value)}")
+    _check_conditions_on_architectures(space, source)
     _check_configures(space.baseline, defaults, f"{source}: the baseline")
+
+
+def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -> None:
+    """Check that a setting of some architectures alone is active with these alone."""
+    searched = space.parameters.get("architecture")
+    for architecture in getattr(searched, "values", ()):
+        foreign = {*NETWORK_HYPERPARAMETERS} - {*ARCHITECTURES[architecture].model_fields}
+        for name in [name for name in space.parameters if name in foreign]:
+            if space.is_active(name, space.making_active(name) | {"architecture": architecture}):
+                owners = [each for each, settings in ARCHITECTURES.items() if name in settings.model_fields]
+                raise ConfigError(
+                    f"{source}: `parameters.{name}`: is no setting of {architecture}, which the space searches too; "
+                    f"give it `when = {{ architecture = {json.dumps(owners)} }}`."
+                )
 
 
 def _check_configures(parameters: Mapping[str, Value], defaults: Configuration, what: str) -> None:

@@ -99,10 +99,6 @@ def write_space(space: SearchSpace, path: Path | str) -> None:
     write_text(Path(path), tomli_w.dumps(space.model_dump(mode="json", exclude_defaults=True)))
 
 
-def _explained(parameter: Parameter, reason: str) -> Parameter:
-    return parameter.model_copy(update={"reason": f"{parameter.reason} {reason[0].upper()}{reason[1:]}."})
-
-
 def _counts(record: TrialRecord) -> bool:
     return not record.is_closed_form and record.outcome not in ("failed", "interrupted")
 

@@ -16,7 +16,7 @@ from cconv.validation import Id, check_setting
 
 FORMAT = 3  # of a run folder; another one is refused
 
-_PART = re.compile(r"\..+-\d+(\.[a-z]+)?")  # names of what is being written, which a kill leaves behind
+_PART = re.compile(r"\..+-\d+(\.\w+)?")  # names of what is being written, which a kill leaves behind
 _FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json
 
 
@@ -96,9 +96,8 @@ class RunFolder:
                     f"{self.path}: another run works in this folder; wait for it (`cconv study status`) or stop it."
                 ) from error
             except OSError as error:
-                raise ConfigError(
-                    f"{lock}: cannot be locked ({error.strerror}); put the run folder on a file system with locks."
-                ) from error
+                way_out = "make it writable" if isinstance(error, PermissionError) else "use a file system with locks"
+                raise ConfigError(f"{lock}: cannot be locked ({error.strerror or error}); {way_out}.") from error
             yield
 
     def trial(self, trial_id: str) -> TrialFolder:

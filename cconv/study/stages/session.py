@@ -65,15 +65,17 @@ class Session:
     def space_of(self, stage: str) -> SearchSpace:
         """The study's space, or the one that an earlier stage refined for this one."""
         refined = self.study.stages[stage].space_from
-        return self.space if refined is None else load_space(self.run.path / "stages" / f"{refined}.toml")
+        if refined is None:
+            return self.space
+        return load_space(self.run.path / "stages" / f"{refined}.toml", self.study)
 
     def affordable(self, parameters: Mapping) -> bool:
         """Whether a configuration is below the space's caps on cost, and possible in this scene."""
-        caps = self.space.caps
         try:
-            return not caps or all(getattr(self.count_cost(parameters), name) <= cap for name, cap in caps.items())
+            cost = self.count_cost(parameters)
         except ConfigError:
             return False
+        return all(getattr(cost, name) <= cap for name, cap in self.space.caps.items())
 
     def observers(self, mirrored: bool) -> Sequence[Observer]:
         """Who sees the trials of a stage."""

@@ -206,6 +206,10 @@ def costing(flops):
         (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
         (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
         (
+            ARCHITECTURE + INT,
+            r'kernel_size`: is no setting of radial_net, .* `when = . architecture = \["conv_net"\] .`',
+        ),
+        (
             ARCHITECTURE.replace('= "conv_net"', '= "radial_net"') + SKIP,
             r"the baseline is not possible .skip: Input should be 'before_activation'",
         ),

@@ -200,10 +200,10 @@ def test_what_is_no_regular_file_is_refused_without_reading_it(tmp_path):
         ("task.kernel=cubic", r"`task\.kernel`: must be one of cubic_spline"),
         ("task.smoothing_length=1e300", r"`task\.smoothing_length`: input should be less than"),
         ("task.name=density_rat", r"`task\.name`: input should be 'density_rate' or 'density_gradient'"),
-        ('task.features=["velocity", "densit"]', "no feature 'densit'; Did you mean 'density'"),
-        ('task.features=["walls"]', "the feature `velocity` must be one of `features`"),
+        ('task.features=["velocity", "densit"]', "no feature 'densit'. Did you mean 'density'"),
+        ('task.features=["walls"]', "the feature 'velocity' must be one of `features`"),
         ("network.architecture=grid", "does not match any of the expected tags: 'conv_net', 'radial_net'"),
-        ("network.radial_terms=8", r"unknown key `network\.radial_terms`"),
+        ("network.radial_terms=8", r"unknown key `network\.radial_terms`\. Known: architecture, relative_cutoff"),
     ],
 )
 def test_a_task_or_network_that_is_none_is_named(study_file, override, message):
