@@ -24,8 +24,8 @@ def train(
 ) -> None:
     """Train the network of a study file, without a search.
 
-    Its tables network and training are used; without a table network that is the published baseline. The checkpoint of
-    the smallest validation error stands in DIR/checkpoint, also after Ctrl-C.
+    The file's tables task, network and training say what; without a table network it is the published ConvNet. The
+    checkpoint with the smallest validation error is in DIR/checkpoint, also after Ctrl-C.
     """
     from cconv.study.records.trials import TrialFolder
     from cconv.study.running.problem import provenance
@@ -65,9 +65,9 @@ def fit(
     ] = 1e-10,
     settings: Settings = None,
 ) -> None:
-    """Fit a single layer to a study's data in closed form: seconds, no training.
+    """Fit a single layer to a study's data by least squares: seconds, no training.
 
-    The study's table network says which layer, e.g. experiments/closed_form.toml: layers = 1, architecture =
+    The file's table network says which layer, as in experiments/closed_form.toml: layers = 1, architecture =
     "radial_net" or "conv_net", message, relative_cutoff, window. The checkpoint evaluates like a trained one
     (`cconv evaluate DIR`).
     """
@@ -116,10 +116,11 @@ def evaluate(
     force: Force = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Error of a saved model on a split of a data set; by default the test split it was reported on.
+    """Report the error of a saved model on a split of a data set, by default the test split.
 
-    Models know no units of the data, so that other data may have another resolution. Their masses, spacing and time are
-    their own, or given here; those of the checkpoint are only for the data that it was trained on.
+    A model works at any resolution, because it computes in particle spacings, rest densities and frame intervals.
+    Masses, spacing and time step are read from the data or given here; those in the checkpoint hold for the data that
+    it was trained on alone.
     """
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
@@ -195,7 +196,7 @@ def _print_evaluation(facts: Mapping) -> None:
 
 
 def report(path: RunPath) -> None:
-    """Write report.html of a run again, also of one that was interrupted."""
+    """Write the report.html of a run again; it works for interrupted runs too."""
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report

@@ -71,12 +71,12 @@ def run(
     storage: Storage = None,
     settings: Settings = None,
 ) -> None:
-    """Run a whole study: the stages that its file declares, then the report.
+    """Run a whole study: every stage that its file declares, then the report.
 
-    Trials run at once on all cores, one core each, unless --serial is given, and stop early by ASHA. The best
-    configurations and the baseline are retrained with fresh seeds, tested on frames that no stage has seen, and timed
-    alone, in turn. Ctrl-C stops cleanly: what was recorded stays readable (`cconv study status`, `cconv report`), and
-    `cconv study resume` goes on, also after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
+    Trials run in parallel, one on each core, and stop early by ASHA; with --serial they run one after another, without
+    Ray. The best configurations and the baseline are retrained with fresh seeds, timed in turn, and tested on frames
+    that no stage has seen. Ctrl-C stops cleanly: records stay readable (`cconv study status`, `cconv report`), and
+    `cconv study resume` continues, also after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
     from cconv.study.declared.search_space import load_space
     from cconv.study.pipeline import begin_study
@@ -104,10 +104,10 @@ def run(
 def resume(
     path: RunPath, data: DataPath = None, address: Address = None, serial: Serial = False, storage: Storage = None
 ) -> None:
-    """Go on with a study that was interrupted or killed, at most one evaluation interval of each trial behind.
+    """Continue a study that was interrupted or killed.
 
-    Stages that came to their end are kept, trials that ended too; others go on from their last evaluation, and the
-    rungs of ASHA are those that they were.
+    Finished stages and finished trials are kept. Each other training continues from its last evaluation, and what ASHA
+    decided before stays decided.
     """
     from cconv.study.pipeline import move_data
     from cconv.study.records.run_folder import RunFolder
@@ -128,7 +128,7 @@ def extend(
     serial: Serial = False,
     storage: Storage = None,
 ) -> None:
-    """Give a search of a study more trials, and run the stages that read it again on what is trained already."""
+    """Add trials to a search of a study, then rerun the stages that read it; trainings that exist are used again."""
     from cconv.study.pipeline import extend_study
     from cconv.study.records.run_folder import RunFolder
 
