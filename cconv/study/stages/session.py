@@ -71,11 +71,11 @@ class Session:
 
     def affordable(self, parameters: Mapping) -> bool:
         """Whether a configuration is below the space's caps on cost, and possible in this scene."""
+        caps = self.space.caps
         try:
-            cost = self.count_cost(parameters)
+            return not caps or all(getattr(self.count_cost(parameters), name) <= cap for name, cap in caps.items())
         except ConfigError:
             return False
-        return all(getattr(cost, name) <= cap for name, cap in self.space.caps.items())
 
     def observers(self, mirrored: bool) -> Sequence[Observer]:
         """Who sees the trials of a stage."""
