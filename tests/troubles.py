@@ -10,7 +10,7 @@ from conftest import SMOKE
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
-from cconv.study.running.trial_queue import Job
+from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
 from cconv.study.studies import load_study
 
 FULL = 2
@@ -66,3 +66,9 @@ def end_of(folder, seed) -> tuple[str, str] | None:
     """How a job ended and why; None if it did not."""
     trial = TrialFolder(folder / f"trial_{seed}")
     return (trial.read().outcome, trial.read().reason) if trial.ended else None
+
+
+def trained_in(pool, study, folder, seeds, judge=None) -> dict:
+    """Train models of some initial weights in a pool; gives how each ended and why."""
+    pool.run(TrialQueue(jobs_in(folder, seeds), FULL, judge or NothingStops(), []), "random", study.training)
+    return {seed: end_of(folder, seed) for seed in seeds}

@@ -6,7 +6,6 @@ import random
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from cconv.evaluation.memory import peak_megabytes
 from cconv.models.model import Model, ModelConfig
 from cconv.neighbors import radius_graph
 from cconv.networks.counting import NeighborDensity
+from cconv.ops.workers import torch_threads
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
 from cconv.tasks.features import FluidState, Inputs
@@ -114,7 +114,7 @@ def measure_costs(
     loaded = {name: load(path) for name, path in models.items()}
     calls = {name: _model_call(model, frames, scene) for name, model in loaded.items()}
     calls[ANALYTIC] = _analytic_call(task, frames, scene)
-    with _threads(threads):
+    with torch_threads(threads):
         times = _times_in_turn(calls, repeats)
     peaks = peak_megabytes(load, models, frames[0], scene, threads)
     particles = statistics.fmean(_num_fluid(frame) for frame in frames)
@@ -197,7 +197,7 @@ def measure_growth(
     if analytic is not None:
         callers[ANALYTIC] = partial(_analytic_block_call, analytic)
     measured: dict[str, list[FrameTime]] = {name: [] for name in callers}
-    with _threads(threads):
+    with torch_threads(threads):
         for size in sizes:
             going_on = {
                 name: call_of(size)
@@ -361,13 +361,3 @@ def _exponent(times: Sequence[FrameTime]) -> float:
         return math.nan
     sizes, medians = zip(*((time.num_particles, time.ms_per_frame) for time in times), strict=True)
     return statistics.linear_regression([math.log(n) for n in sizes], [math.log(ms) for ms in medians]).slope
-
-
-@contextmanager
-def _threads(count: int):
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

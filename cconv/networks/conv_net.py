@@ -19,13 +19,8 @@ from cconv.networks.counting import (
     INDEX,
     CountedConv,
     CountedCost,
-    NeighborDensity,
     Pairs,
-    count_arrays,
     count_filters,
-    count_linear,
-    count_search,
-    total,
     window_arrays,
 )
 from cconv.networks.network import (
@@ -278,23 +273,7 @@ class ConvNetSettings(ConvolutionSettings):
             normalize=self.normalize,
         )
 
-    def count(
-        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
-    ) -> CountedCost:
-        """Cost of one particle's prediction; arguments as of `NetworkSettings.count`."""
-        fluid, boundary = around.pairs(self.relative_cutoff, dim)
-        searched = [fluid] if walls is None else [fluid, boundary]
-        convs, dense = self._parts(inputs, walls, outputs, dim, fluid, boundary)
-        return total(
-            [
-                *(self._count_conv(conv, dim) for conv in convs),
-                *(count_arrays(self._arrays(dim), pairs) for pairs in searched),
-                *(count_search(pairs, dim) for pairs in searched),
-                *(count_linear(before, after, dim) for before, after in dense),
-            ]
-        )
-
-    def _parts(
+    def _counted_layers(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, fluid: Pairs, boundary: Pairs
     ) -> tuple[list[CountedConv], list[tuple[Kinds, Kinds]]]:
         """Convolutions and fully connected layers; a grid knows scalars alone."""
@@ -315,7 +294,7 @@ class ConvNetSettings(ConvolutionSettings):
         sizes = conv.inputs.scalars, conv.outputs.scalars, self.kernel_size**dim, corners
         return count_filters(*sizes, conv.pairs.senders, conv.pairs.neighbors, pair)
 
-    def _arrays(self, dim: int) -> int:
+    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
         """Arrays of all pairs from displacements to cells, fractions and weights, as `nn.filters` makes them."""
         mapped = {
             "identity": 0,

@@ -10,7 +10,16 @@ from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import Edges
-from cconv.networks.counting import CountedCost, NeighborDensity
+from cconv.networks.counting import (
+    CountedConv,
+    CountedCost,
+    NeighborDensity,
+    Pairs,
+    count_arrays,
+    count_linear,
+    count_search,
+    total,
+)
 from cconv.nn.continuous_conv import ConvGeometry
 from cconv.nn.kinds import Kinds
 from cconv.nn.radial_conv import RadialGeometry
@@ -180,6 +189,36 @@ class ConvolutionSettings(NetworkSettings):
         A scalar from differences has none, so that it is 0 where nothing differs.
         """
         return not self.takes_differences or outputs.vectors > 0
+
+    def count(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
+    ) -> CountedCost:
+        """Cost of one particle's prediction: of convolutions, geometry, neighbour search and linear maps."""
+        fluid, boundary = around.pairs(self.relative_cutoff, dim)
+        searched = [fluid] if walls is None else [fluid, boundary]
+        convs, maps = self._counted_layers(inputs, walls, outputs, dim, fluid, boundary)
+        return total(
+            [
+                *(self._count_conv(conv, dim) for conv in convs),
+                *(count_arrays(self._geometry_arrays(dim, pairs, convs), pairs) for pairs in searched),
+                *(count_search(pairs, dim) for pairs in searched),
+                *(count_linear(before, after, dim) for before, after in maps),
+            ]
+        )
+
+    @abstractmethod
+    def _counted_layers(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, fluid: Pairs, boundary: Pairs
+    ) -> tuple[list[CountedConv], list[tuple[Kinds, Kinds]]]:
+        """Convolutions and linear maps of all layers."""
+
+    @abstractmethod
+    def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
+        """Cost of a convolution."""
+
+    @abstractmethod
+    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
+        """How many arrays of all pairs the geometry takes, for these convolutions."""
 
     def sent(self, inputs: Kinds) -> Kinds:
         """What particles send to each other: without the constant where they send differences."""

@@ -16,12 +16,8 @@ from cconv.networks.counting import (
     INDEX,
     CountedConv,
     CountedCost,
-    NeighborDensity,
     Pairs,
-    count_arrays,
     count_filters,
-    count_linear,
-    count_search,
     total,
     window_arrays,
 )
@@ -275,24 +271,8 @@ class RadialNetSettings(ConvolutionSettings):
         """Radial terms and direction of each pair."""
         return RadialGeometry(edges, self.radial_terms, window=self.window, normalize=self.normalize)
 
-    def count(
-        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
-    ) -> CountedCost:
-        """Cost of one particle's prediction; arguments as of `NetworkSettings.count`."""
-        fluid, boundary = around.pairs(self.relative_cutoff, dim)
-        searched = [fluid] if walls is None else [fluid, boundary]
-        convs, dense = self._parts(inputs, walls, outputs, fluid, boundary)
-        return total(
-            [
-                *(self._count_conv(conv, dim) for conv in convs),
-                *(count_arrays(self._arrays(dim, pairs, convs), pairs) for pairs in searched),
-                *(count_search(pairs, dim) for pairs in searched),
-                *(count_linear(before, after, dim) for before, after in dense),
-            ]
-        )
-
-    def _parts(
-        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, fluid: Pairs, boundary: Pairs
+    def _counted_layers(
+        self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, fluid: Pairs, boundary: Pairs
     ) -> tuple[list[CountedConv], list[tuple[Kinds, Kinds]]]:
         """Convolutions and linear maps; each vector of a hidden layer has a scalar for its gate."""
         hidden = [Kinds(width, width) for width in self.hidden_widths]
@@ -321,7 +301,7 @@ class RadialNetSettings(ConvolutionSettings):
         written = CountedCost(bytes_per_particle=messages)
         return total([written, count_filters(of_scalars, to_scalars, *shape), *of_each_axis])
 
-    def _arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
+    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
         """Arrays of all pairs: the window, and terms and directions where a convolution takes messages of each."""
         weighted = self.window != "none" or self.normalize
         arrays = window_arrays(self.window, self.normalize) if weighted else 0

@@ -6,8 +6,9 @@ oversubscribe two cores.
 
 import ctypes
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from multiprocessing import current_process
 from typing import Any
@@ -49,6 +50,17 @@ def results_of(calls: Sequence[Callable[[], Any]]) -> list:
 
     run_on_workers(work, len(calls))
     return results
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Compute with so many threads of torch, then with as many as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @lru_cache(maxsize=4)

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from cconv.study.declared.study_file import TrainingConfig
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.running.trial_queue import TrialQueue
 
 

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from cconv.errors import ConfigError, is_disk_full
-from cconv.study.declared.study_file import StudyConfig, TrainingConfig
+from cconv.study.declared.configuration import TrainingConfig
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.attempt import Attempt
 from cconv.study.running.problem import Problem, provenance

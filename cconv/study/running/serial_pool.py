@@ -1,11 +1,10 @@
 """Trainings one after another in this process, without Ray."""
 
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 
-import torch
-
-from cconv.study.declared.study_file import StudyConfig, TrainingConfig
+from cconv.ops.workers import torch_threads
+from cconv.study.declared.configuration import TrainingConfig
+from cconv.study.declared.study_file import StudyConfig
 from cconv.study.running.problem import Problem
 from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, train_recorded
 from cconv.study.running.trial_queue import Job, TrialQueue
@@ -30,7 +29,7 @@ class SerialPool:
         Raises:
             ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
         """
-        with _one_thread():
+        with torch_threads(1):  # as a process of a pool, on whose number the last bits of sums depend
             while (job := queue.next()) is not None:
                 queue.on_end(job.name, *self._train(job, queue, stage, training))
 
@@ -45,14 +44,3 @@ class SerialPool:
                 if not queue.on_result(job.name, entry):
                     break
         return queue.outcome_after(entry), ""
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute as a process of a pool does, whose sums depend on the number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

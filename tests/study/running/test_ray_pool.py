@@ -9,12 +9,11 @@ import pytest
 import ray
 import troubles
 from processes import PATIENCE
-from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, troubled_problem
+from troubles import BrokenJudge, study_of, trained_in, troubled_problem
 
 from cconv.errors import ConfigError
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.ray_pool import STARTS, RayPool, _start, ray_pool
-from cconv.study.running.trial_queue import NothingStops, TrialQueue
 
 pytestmark = pytest.mark.integration
 
@@ -39,9 +38,7 @@ def train(cores, problem, flow_folder, tmp_path):
 
     def run(seeds, *settings, judge=None):
         study = study_of(flow_folder, *settings)
-        queue = TrialQueue(jobs_in(tmp_path, seeds), FULL, judge or NothingStops(), [])
-        RayPool(study, problem, tmp_path / "ray").run(queue, "random", study.training)
-        return {seed: end_of(tmp_path, seed) for seed in seeds}
+        return trained_in(RayPool(study, problem, tmp_path / "ray"), study, tmp_path, seeds, judge)
 
     return run
 

@@ -5,13 +5,13 @@ import errno
 import pytest
 import torch
 from systems import problem as sound_problem
-from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, troubled_problem
+from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, trained_in, troubled_problem
 
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import load_model
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.serial_pool import SerialPool
-from cconv.study.running.trial_queue import NothingStops, TrialQueue
+from cconv.study.running.trial_queue import TrialQueue
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +25,7 @@ def train(problem, flow_folder, tmp_path):
 
     def run(seeds, *settings, judge=None):
         study = study_of(flow_folder, *settings)
-        queue = TrialQueue(jobs_in(tmp_path, seeds), FULL, judge or NothingStops(), [])
-        SerialPool(study, problem).run(queue, "random", study.training)
-        return {seed: end_of(tmp_path, seed) for seed in seeds}
+        return trained_in(SerialPool(study, problem), study, tmp_path, seeds, judge)
 
     return run
 
