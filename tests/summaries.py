@@ -41,20 +41,20 @@ def whole_summary(summary: dict) -> dict:
     whole["partial_dependence"] = [dependence("choice", ["poly6", "none"]), dependence("log", [1e-3, 1e-2])]
     whole["ablation"] = {
         "path": [
-            {"change": "baseline", "parameters": 9000, "valid_normalized_mse": 0.016, "low": 0.012, "high": 0.02},
-            {"change": "lost", "parameters": 90, "valid_normalized_mse": None, "low": None, "high": None},
-            {"change": "layers: 2", "parameters": 900, "valid_normalized_mse": 0.002, "low": 0.001, "high": 0.003},
+            {"change": "baseline", "parameters": 9000, "valid_error": 0.016, "low": 0.012, "high": 0.02},
+            {"change": "lost", "parameters": 90, "valid_error": None, "low": None, "high": None},
+            {"change": "layers: 2", "parameters": 900, "valid_error": 0.002, "low": 0.001, "high": 0.003},
         ],
         "branches": [
             {"left_out": "dense", "normalized_mse": 0.004, "ms_per_frame": 3.9, "ratio": 4.21},
             {
                 "left_out": "walls",
-                "valid_normalized_mse": 0.002,
+                "valid_error": 0.002,
                 "of": 0.001,
                 "flops_per_particle": 900.0,
                 "parameters": {"walls": True},
             },
-            {"left_out": "density", "valid_normalized_mse": None, "of": 0.001, "flops_per_particle": None},
+            {"left_out": "density", "valid_error": None, "of": 0.001, "flops_per_particle": None},
         ],
     }
     whole["mean_predictor"] = {"valid": 4.5, "test": 1.58}
@@ -153,7 +153,7 @@ def _search_points() -> list[dict]:
         {
             "id": f"{stage}_{number:04d}",
             "stage": stage,
-            "valid_normalized_mse": 10.0 ** (number - 3),
+            "valid_error": 10.0 ** (number - 3),
             "ms_per_frame": 2.0 + number,
             "measured": stage == "closed_form",
             "num_parameters": 100 * number + 7,
@@ -163,7 +163,7 @@ def _search_points() -> list[dict]:
         for stage in ("closed_form", "random", "second look")
         for number in range(5)
     ]
-    return [*points, points[-1] | {"id": "lost", "outcome": "diverged", "valid_normalized_mse": None}]
+    return [*points, points[-1] | {"id": "lost", "outcome": "diverged", "valid_error": None}]
 
 
 def _size(num_particles: int) -> dict:

@@ -29,17 +29,15 @@ def train(
     """
     from cconv.study.records.trials import TrialFolder
     from cconv.study.running.problem import provenance
-    from cconv.study.running.trial import run_trial
+    from cconv.study.running.trial import Trial, run_trial
 
     config, problem, dataset = _study_and_problem(study, data, settings, out)
     folder = TrialFolder(out)
+    seeds = {"init_seed": config.seeds.init, "data_seed": config.seeds.data}
+    trial = Trial(stage="train", parameters={}, provenance=provenance(config, dataset), **seeds)
     try:
         with TrainingBar(errors, config.name, config.training.updates) as bar:
-            trial = run_trial(
-                problem, {}, config.configuration, folder, stage="train", init_seed=config.seeds.init,
-                data_seed=config.seeds.data, provenance=provenance(config, dataset), on_update=bar.on_update,
-            )  # fmt: skip
-            entries = list(trial)
+            entries = list(run_trial(problem, trial, config.configuration, folder, on_update=bar.on_update))
     except CConvError:
         shutil.rmtree(out, ignore_errors=True)
         raise
@@ -52,8 +50,10 @@ def train(
         errors.print(f"Diverged at update {entries[-1]['updates']}: a loss is not finite; lower the learning rate.")
         raise typer.Exit(1)
     folder.finish("completed")
-    best = min(entry["valid_normalized_mse"] for entry in entries)
-    results.print(f"Best validation error {best:.4g} (normalized MSE). Checkpoint: {folder.checkpoint}", soft_wrap=True)
+    best = min(entry["valid_error"] for entry in entries)
+    results.print(
+        f"Best validation error {best:.4g} ({problem.objective.label}). Checkpoint: {folder.checkpoint}", soft_wrap=True
+    )
 
 
 def fit(
@@ -73,7 +73,6 @@ def fit(
     """
     from cconv.models.checkpoint import save_model
     from cconv.models.closed_form import solve_closed_form
-    from cconv.models.errors import frame_errors, normalized_mse
     from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
 
@@ -81,7 +80,7 @@ def fit(
     config, problem, dataset = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.configuration, config.seeds.init)
     solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
-    error = normalized_mse(frame_errors(model, show_progress(problem.valid_samples, "validate")))
+    error = problem.objective.error(model, show_progress(problem.valid_samples, "validate"))
     card = {
         "stage": "closed_form",
         "features": list(model.config.features),
@@ -89,13 +88,11 @@ def fit(
         "ridge": ridge,
         "data_seed": config.seeds.data,
         "num_parameters": model.num_parameters,
-        "valid_normalized_mse": error,
+        "valid_error": error,
     }
     save_model(model, out, card | provenance(config, dataset))
-    results.print(
-        f"Validation error {error:.4g} (normalized MSE), {model.num_parameters:,} parameters. Checkpoint: {out}",
-        soft_wrap=True,
-    )
+    figures = f"{error:.4g} ({problem.objective.label}), {model.num_parameters:,} parameters"
+    results.print(f"Validation error {figures}. Checkpoint: {out}", soft_wrap=True)
 
 
 def evaluate(

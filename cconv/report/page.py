@@ -69,7 +69,7 @@ def _search_parts(run: RunFolder, summary: Mapping | None) -> dict:
     """What the trials show, also of a run that is not finished, for which the mean predictor is not known yet."""
     mean = {"mean_predictor": summary["mean_predictor"]["valid"] if summary else None}
     trials, curves = trials_table(run), curves_table(run)
-    searched = not trials.empty and bool(trials["valid_normalized_mse"].notna().any())
+    searched = not trials.empty and bool(trials["valid_error"].notna().any())
     return {
         "curves_chart": _picture(learning_curves_chart(curves, **mean)) if searched else None,
         "search_chart": _picture(best_so_far_chart(trials, **mean)) if searched else None,
@@ -81,8 +81,8 @@ def _with_mean_predictor(trials: pd.DataFrame, mean_predictor: float | None) -> 
     """Trials by error, with a row of the mean predictor in its place, where it is known."""
     table = trials.astype(object)  # a row with gaps would turn whole numbers into fractions
     if mean_predictor is not None:
-        table.loc[len(table), ["trial", "valid_normalized_mse"]] = [MEAN_PREDICTOR, mean_predictor]
-    return table.sort_values("valid_normalized_mse")
+        table.loc[len(table), ["trial", "valid_error"]] = [MEAN_PREDICTOR, mean_predictor]
+    return table.sort_values("valid_error")
 
 
 def _finished_parts(run: RunFolder, summary: Mapping) -> dict:

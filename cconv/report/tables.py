@@ -20,7 +20,7 @@ def trials_table(run: RunFolder) -> pd.DataFrame:
             "stage": record.stage,
             "outcome": record.outcome,
             "updates": record.last["updates"] if record.last else 0,
-            "valid_normalized_mse": record.last["valid_normalized_mse"] if record.last else float("nan"),
+            "valid_error": record.last["valid_error"] if record.last else float("nan"),
             "seconds": record.log[-1]["seconds"] if record.log else 0.0,
             "num_parameters": record.config["num_parameters"],
             **record.parameters,
@@ -63,7 +63,7 @@ def finalists_table(summary: Mapping) -> pd.DataFrame:
         rows.append(
             {
                 "model": entry["id"],
-                "valid_normalized_mse": entry["valid"]["normalized_mse"],
+                "valid_error": entry["valid"]["normalized_mse"],
                 "normalized_mse": entry["test"]["normalized_mse"],
                 "ci95_low": low,
                 "ci95_high": high,
@@ -158,10 +158,10 @@ def importance_table(summary: Mapping) -> pd.DataFrame:
 
 def _reference_rows(summary: Mapping) -> list[dict]:
     trivial, analytic = summary["mean_predictor"], summary.get("analytic")
-    row = {"model": MEAN_PREDICTOR, "valid_normalized_mse": trivial["valid"], "normalized_mse": trivial["test"]}
+    row = {"model": MEAN_PREDICTOR, "valid_error": trivial["valid"], "normalized_mse": trivial["test"]}
     rows = [row | {"relative_rmse": math.sqrt(trivial["test"])}]
     if analytic:
-        exact = dict.fromkeys(("valid_normalized_mse", "normalized_mse", "relative_rmse"), 0.0)
+        exact = dict.fromkeys(("valid_error", "normalized_mse", "relative_rmse"), 0.0)
         times = {name: analytic[name] for name in ("ms_per_frame", "ms_low", "ms_high")}
         rows.append({"model": ANALYTIC} | exact | times)
     return rows
@@ -196,7 +196,7 @@ def _search_points(summary: Mapping) -> list[dict]:
             "name": point["id"],
             "kind": "search",
             "group": point["stage"],
-            "error": point["valid_normalized_mse"],
+            "error": point["valid_error"],
             "ms": point["ms_per_frame"],
             "measured": point["measured"],
             "num_parameters": point["num_parameters"],
@@ -204,5 +204,5 @@ def _search_points(summary: Mapping) -> list[dict]:
             "hyperparameters": point["parameters"],
         }
         for point in summary.get("search_points", [])
-        if point["valid_normalized_mse"] is not None and point["ms_per_frame"] is not None
+        if point["valid_error"] is not None and point["ms_per_frame"] is not None
     ]

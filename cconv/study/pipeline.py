@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
-from cconv.models.errors import mean_predictor_error, normalized_mse
 from cconv.study.declared.domains import SearchSpace, fixed
 from cconv.study.declared.search_space import check_baseline_affordable
 from cconv.study.declared.stage import Stage, Trials, readers_of
@@ -175,7 +174,7 @@ def _session(
             start_pool=start_pool,
             count_cost=count_cost,
             progress=progress,
-            useless_error=normalized_mse(mean_predictor_error(problem.valid_samples, problem.train_samples)),
+            useless_error=problem.objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
         )
 
 

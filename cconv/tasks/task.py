@@ -26,6 +26,7 @@ class FieldTask(ABC):
 
     name: ClassVar[str]
     symbol: ClassVar[str]  # of the field, for charts
+    objective: ClassVar[str] = "normalized_mse"  # what models are compared by, of `evaluation.objectives`
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
     optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without

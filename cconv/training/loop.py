@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 
 from cconv.errors import check_choice
-from cconv.models.errors import frame_errors, normalized_mse
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
 from cconv.training.batches import batches
@@ -25,6 +24,33 @@ SCHEDULES = {
 
 
 @dataclass(frozen=True, kw_only=True)
+class Optimization:
+    """Budget and optimiser of a training.
+
+    Attributes:
+        updates: Gradient updates in all.
+        evaluate_every: Updates between evaluations; the last update is always evaluated.
+        batch_size: Frames of an update.
+        learning_rate: Initial learning rate of Adam.
+        schedule: "constant", "cosine" or "exponential"; the latter two fall to 1 %.
+    """
+
+    updates: int
+    evaluate_every: int
+    batch_size: int = 1
+    learning_rate: float = 1e-3
+    schedule: str = "cosine"
+
+    def rate_at(self, update: int) -> float:
+        """Learning rate of an update, counted from 1."""
+        return self.learning_rate * SCHEDULES[self.schedule]((update - 1) / self.updates)
+
+    def is_evaluated(self, update: int) -> bool:
+        """Whether an evaluation follows an update."""
+        return update % self.evaluate_every == 0 or update == self.updates
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainingState:
     """Where training stands after a gradient update.
 
@@ -32,7 +58,7 @@ class TrainingState:
         updates: Gradient updates done.
         train_loss: Mean squared error of standardised targets in this update's batch.
         learning_rate: Learning rate of this update.
-        valid_normalized_mse: Validation error, where this update was followed by an evaluation, else None.
+        valid_error: Validation error, where this update was followed by an evaluation, else None.
         seconds: Time since training began, evaluations included.
         diverged: Whether a loss or validation error was not finite; training ends there.
     """
@@ -40,21 +66,17 @@ class TrainingState:
     updates: int
     train_loss: float
     learning_rate: float
-    valid_normalized_mse: float | None
+    valid_error: float | None
     seconds: float
     diverged: bool
 
 
 def train(
     model: Model,
-    train_samples: Sequence[Sample],
-    valid_samples: Sequence[Sample],
+    samples: Sequence[Sample],
+    valid_error: Callable[[Model, GeometryCache], float],
+    optimization: Optimization,
     *,
-    updates: int,
-    evaluate_every: int,
-    batch_size: int = 1,
-    learning_rate: float = 1e-3,
-    schedule: str = "cosine",
     data_seed: int = 0,
     cache_bytes: int = 2**31,
     progress: Progress | None = None,
@@ -63,13 +85,9 @@ def train(
 
     Args:
         model: Model to train.
-        train_samples: Frames to learn from.
-        valid_samples: Frames of the validation error.
-        updates: Gradient updates in all.
-        evaluate_every: Updates between evaluations; the last update is always evaluated.
-        batch_size: Frames of an update.
-        learning_rate: Initial learning rate of Adam.
-        schedule: "constant", "cosine" or "exponential"; the latter two fall to 1 %.
+        samples: Frames to learn from.
+        valid_error: Validation error of the model, given a cache of geometries.
+        optimization: Budget and optimiser.
         data_seed: Seed of the batch order.
         cache_bytes: Memory for the geometries of frames, at most.
         progress: Where an earlier training of the same model and settings stands, from where it goes on as if it had
@@ -78,25 +96,26 @@ def train(
     Raises:
         ConfigError: If the schedule is unknown.
     """
-    check_choice("schedule", schedule, SCHEDULES)
+    check_choice("schedule", optimization.schedule, SCHEDULES)
     progress = progress or begin(model)
     start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
-    order = islice(batches(len(train_samples), batch_size, data_seed), progress.updates, updates)
+    order = batches(len(samples), optimization.batch_size, data_seed)
+    order = islice(order, progress.updates, optimization.updates)
     for update, indices in enumerate(order, start=progress.updates + 1):
-        rate = learning_rate * SCHEDULES[schedule]((update - 1) / updates)
+        rate = optimization.rate_at(update)
         progress.optimizer.param_groups[0]["lr"] = rate
-        loss = _update(model, [train_samples[index] for index in indices], progress.optimizer, geometry)
+        loss = _update(model, [samples[index] for index in indices], progress.optimizer, geometry)
         valid = None
-        if math.isfinite(loss) and (update % evaluate_every == 0 or update == updates):
-            valid = normalized_mse(frame_errors(model, valid_samples, geometry))
+        if math.isfinite(loss) and optimization.is_evaluated(update):
+            valid = valid_error(model, geometry)
         diverged = not math.isfinite(loss) or (valid is not None and not math.isfinite(valid))
         progress.updates, progress.seconds = update, time.perf_counter() - start
         yield TrainingState(
             updates=update,
             train_loss=loss,
             learning_rate=rate,
-            valid_normalized_mse=valid,
+            valid_error=valid,
             seconds=progress.seconds,
             diverged=diverged,
         )

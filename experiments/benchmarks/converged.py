@@ -20,14 +20,13 @@ from rich.progress import track
 
 from cconv.files import write_json
 from cconv.models.checkpoint import load_model
-from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.report.plots import budget_chart
 from cconv.study.declared.search_space import load_space
 from cconv.study.declared.stage import BASELINE
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
-from cconv.study.running.trial import run_trial
+from cconv.study.running.trial import Trial, run_trial
 from cconv.study.studies import load_study
 
 STUDY = Path(__file__).parents[1] / "dpi_converged.toml"
@@ -51,24 +50,26 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
         place: Folder for its progress.
 
     Returns:
-        "model", "seed", "updates", "parameters", "log" (updates, seconds, valid_normalized_mse), and the normalized MSE
+        "model", "seed", "updates", "parameters", "log" (updates, seconds, valid_error), and the normalized MSE
         of the best checkpoint, "valid" and "test", beside those of predicting the mean.
     """
     dataset = open_study_data(study.data, study.seeds.data)
     problem = load_problem(study, dataset)
     training = study.training.model_copy(update={"updates": updates})
     folder = TrialFolder(place)
-    trial = run_trial(
-        problem, hyperparameters(study)[model], study.configuration._replace(training=training), folder, stage="train",
-        init_seed=seed, data_seed=study.seeds.data, provenance=provenance(study, dataset),
+    trial = Trial(
+        stage="train", parameters=hyperparameters(study)[model], init_seed=seed, data_seed=study.seeds.data,
+        provenance=provenance(study, dataset),
     )  # fmt: skip
-    for _ in track(trial, f"{model}, seed {seed}", total=updates // training.evaluate_every):
+    entries = run_trial(problem, trial, study.configuration._replace(training=training), folder)
+    for _ in track(entries, f"{model}, seed {seed}", total=updates // training.evaluate_every):
         pass
     best = load_model(folder.checkpoint)
     samples = {"valid": problem.valid_samples, "test": list(study_samples(study, dataset, "test"))}
-    errors = {split: normalized_mse(frame_errors(best, each)) for split, each in samples.items()}
-    mean = {split: normalized_mse(mean_predictor_error(each, problem.train_samples)) for split, each in samples.items()}
-    log = [{key: entry[key] for key in ("updates", "seconds", "valid_normalized_mse")} for entry in folder.read().log]
+    objective = problem.objective
+    errors = {split: objective.error(best, each) for split, each in samples.items()}
+    mean = {split: objective.of_mean_predictor(each, problem.train_samples) for split, each in samples.items()}
+    log = [{key: entry[key] for key in ("updates", "seconds", "valid_error")} for entry in folder.read().log]
     facts = {"model": model, "seed": seed, "updates": updates, "num_parameters": best.num_parameters, "log": log}
     return facts | errors | {"mean_predictor": mean}
 

@@ -19,7 +19,7 @@ from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem, load_problem, open_study_data, provenance, with_data_path
 from cconv.study.running.ray_pool import ray_pool
-from cconv.study.running.trial import run_trial
+from cconv.study.running.trial import Trial, run_trial
 from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
 from cconv.study.studies import load_study
 
@@ -51,8 +51,8 @@ def seconds_alone(study: StudyConfig, problem: Problem, folder: Path, repeats: i
         start = time.perf_counter()
         seeds = {"init_seed": job.init_seed, "data_seed": study.seeds.data}
         folder_of_job = TrialFolder(job.folder)
-        facts = {"stage": "alone", "provenance": provenance(study), **seeds}
-        list(run_trial(problem, {}, study.configuration, folder_of_job, **facts))
+        trial = Trial(stage="alone", parameters={}, provenance=provenance(study), **seeds)
+        list(run_trial(problem, trial, study.configuration, folder_of_job))
         taken.append(time.perf_counter() - start)
     return statistics.median(taken)
 

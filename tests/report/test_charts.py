@@ -79,7 +79,7 @@ def test_heights_keep_order_gap_and_range():
 
 
 def test_the_error_axis_shows_all_finalists_and_not_what_diverged(summary):
-    summary["search_points"][0]["valid_normalized_mse"] = 1e9
+    summary["search_points"][0]["valid_error"] = 1e9
     points = speed_accuracy_table(summary)
     low, high = error_range(points, 1.58)
     finalists = points[points["kind"] == "finalist"]

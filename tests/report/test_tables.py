@@ -46,7 +46,7 @@ def test_curves_table_has_a_row_an_evaluation(run):
     table = curves_table(run)
     records = [*run.trials(), *(record for records in run.retrainings().values() for record in records)]
     assert len(table) == sum(len(record.log) for record in records)
-    assert (table["valid_normalized_mse"] > 0).all()
+    assert (table["valid_error"] > 0).all()
 
 
 def test_finalists_table_is_sorted_by_error_between_exact_and_trivial(summary):
@@ -54,7 +54,7 @@ def test_finalists_table_is_sorted_by_error_between_exact_and_trivial(summary):
     assert table["normalized_mse"].is_monotonic_increasing
     assert set(table["model"]) == {entry["id"] for entry in summary["finalists"]} | {ANALYTIC, MEAN_PREDICTOR}
     trivial, exact = (table[table["model"] == name].iloc[0] for name in (MEAN_PREDICTOR, ANALYTIC))
-    assert (trivial["valid_normalized_mse"], trivial["normalized_mse"]) == (4.5, 1.58)
+    assert (trivial["valid_error"], trivial["normalized_mse"]) == (4.5, 1.58)
     assert (exact["normalized_mse"], exact["ms_per_frame"]) == (0, summary["analytic"]["ms_per_frame"])
 
 
@@ -74,7 +74,7 @@ def test_speed_accuracy_table_has_every_point_with_an_error_once(summary):
     table = speed_accuracy_table(summary)
     assert list(table["kind"].unique()) == ["finalist", "search", "analytic"]
     assert list(table.loc[table["kind"] == "finalist", "name"]) == [entry["id"] for entry in summary["finalists"]]
-    known = [point["id"] for point in summary["search_points"] if point["valid_normalized_mse"] is not None]
+    known = [point["id"] for point in summary["search_points"] if point["valid_error"] is not None]
     assert list(table.loc[table["kind"] == "search", "name"]) == known
     assert set(table.loc[table["on_front"], "name"]) == set(summary["pareto_front"])
     assert table.loc[table["name"] == ANALYTIC, "error"].item() == 0

@@ -6,39 +6,37 @@ from systems import configured, problem
 
 from cconv.errors import ConfigError
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.training.loop import SCHEDULES, train
+from cconv.training.loop import SCHEDULES, Optimization, train
 
 LINEAR = configured(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")
 
 
-def run(given, network=LINEAR, seed=0, **options):
+def run(given, network=LINEAR, seed=0, cache_bytes=2**30, **options):
     model = given.build_model(network, seed)
-    options = {"updates": 6, "evaluate_every": 3, "learning_rate": 0.05} | options
-    return model, list(train(model, given.train_samples, given.valid_samples, **options))
+    asked = Optimization(**{"updates": 6, "evaluate_every": 3, "learning_rate": 0.05} | options)
+    return model, list(train(model, given.train_samples, given.valid_error, asked, cache_bytes=cache_bytes))
 
 
 def test_training_learns_the_density_rate(generator):
     _, states = run(problem(generator), updates=120, evaluate_every=60)
-    assert states[-1].valid_normalized_mse < 0.1 < states[0].train_loss
+    assert states[-1].valid_error < 0.1 < states[0].train_loss
 
 
 def test_reported_error_is_the_models(generator):
     given = problem(generator)
     model, states = run(given)
-    assert states[-1].valid_normalized_mse == pytest.approx(normalized_mse(frame_errors(model, given.valid_samples)))
+    assert states[-1].valid_error == pytest.approx(normalized_mse(frame_errors(model, given.valid_samples)))
 
 
 def test_evaluations_come_when_due_and_at_the_end(generator):
     _, states = run(problem(generator), updates=7, evaluate_every=3)
     assert [state.updates for state in states] == list(range(1, 8))
-    assert [state.updates for state in states if state.valid_normalized_mse is not None] == [3, 6, 7]
+    assert [state.updates for state in states if state.valid_error is not None] == [3, 6, 7]
 
 
 def test_the_same_seeds_give_the_same_losses(generator):
     given = problem(generator)
-    first, again = (
-        [(state.train_loss, state.valid_normalized_mse) for state in run(given, batch_size=2)[1]] for _ in range(2)
-    )
+    first, again = ([(state.train_loss, state.valid_error) for state in run(given, batch_size=2)[1]] for _ in range(2))
     assert first == again
 
 
@@ -60,7 +58,7 @@ def test_a_loss_that_is_not_finite_ends_training_and_leaves_the_weights(generato
     model = given.build_model(LINEAR, 0)
     model.target_mean.fill_(math.nan)
     before = model.network.convs[0].filters.clone()
-    states = list(train(model, given.train_samples, given.valid_samples, updates=5, evaluate_every=1))
+    states = list(train(model, given.train_samples, given.valid_error, Optimization(updates=5, evaluate_every=1)))
     assert len(states) == 1
     assert states[0].diverged
     assert torch.equal(model.network.convs[0].filters, before)

@@ -13,12 +13,12 @@ def still_falling(points: Sequence[Mapping], margin: float) -> bool:
     """Whether the last budget lowered the validation error of the one before it by more than `margin`, a share.
 
     Args:
-        points: Entries of ascending budgets with their "valid_normalized_mse"; a single one says nothing, so True.
+        points: Entries of ascending budgets with their "valid_error"; a single one says nothing, so True.
         margin: Share of the error.
     """
     if len(points) < 2:
         return True
-    before, last = (point["valid_normalized_mse"] for point in points[-2:])
+    before, last = (point["valid_error"] for point in points[-2:])
     return last < (1 - margin) * before
 
 
@@ -29,7 +29,7 @@ def fall_at_the_end(records: Sequence[TrialRecord]) -> float | None:
     """
     falls = []
     for record in records:
-        errors = [(entry["updates"], entry["valid_normalized_mse"]) for entry in record.log]
+        errors = [(entry["updates"], entry["valid_error"]) for entry in record.log]
         begin = (1 - LAST_PART) * errors[-1][0] if errors else 0
         before = [error for updates, error in errors if updates <= begin and error is not None]
         if begin and before and min(before) > 0:
@@ -63,6 +63,6 @@ def _gain(name: str, found: Mapping) -> str:
     first, last = found["points"][0], found["points"][-1]
     end = "and it was still falling" if found["still_falling"] else "and more updates bring nothing"
     return (
-        f"The budget of {first['updates']:,} updates decided the error of {name}, {first['valid_normalized_mse']:.3g}: "
-        f"after {last['updates']:,} updates it is {last['valid_normalized_mse']:.3g} (validation), {end}."
+        f"The budget of {first['updates']:,} updates decided the error of {name}, {first['valid_error']:.3g}: "
+        f"after {last['updates']:,} updates it is {last['valid_error']:.3g} (validation), {end}."
     )

@@ -22,7 +22,7 @@ class Entry(OpenModel):
     """A line of log.jsonl."""
 
     updates: _Count
-    valid_normalized_mse: _Error | None
+    valid_error: _Error | None
     seconds: _Error
     train_loss: _Error | None = None
     learning_rate: Real | None = None

@@ -10,6 +10,7 @@ from cconv.data.dataset import Dataset, open_dataset
 from cconv.data.metadata import OVERRIDES
 from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
+from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.model import Model, build_model
 from cconv.study.declared.configuration import Configuration, TaskConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
@@ -34,6 +35,15 @@ class Problem:
     task: FieldTask
     train_samples: list[Sample]
     valid_samples: list[Sample]
+
+    @property
+    def objective(self) -> Objective:
+        """What models are compared by."""
+        return objective_of(self.task)
+
+    def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
+        """Error of a model on the validation split, with geometries computed afresh unless a cache is given."""
+        return self.objective.error(model, self.valid_samples, geometry)
 
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """A fresh model with the initial weights of `init_seed`."""

@@ -9,7 +9,7 @@ from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.attempt import Attempt
 from cconv.study.running.problem import Problem, provenance
-from cconv.study.running.trial import run_trial
+from cconv.study.running.trial import Trial, run_trial
 from cconv.study.running.trial_queue import Job
 from cconv.training.loop import TrainingState
 
@@ -40,7 +40,7 @@ def train_recorded(
     An error of the training is an outcome of the job, not an exception. A training that hangs ends this process.
     """
     limit = _seconds_limit(study, training)
-    last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
+    last = {"updates": 0, "valid_error": None, "diverged": False, "seconds": 0.0}
     outcome, reason = None, ""
     try:
         with Attempt(job.folder, HANGING * limit) as attempt:
@@ -69,20 +69,23 @@ def _trial(
     job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem, attempt: Attempt
 ) -> Iterator[dict]:
     def check_before_writing(state: TrainingState) -> None:
-        if state.valid_normalized_mse is not None or state.diverged:
+        if state.valid_error is not None or state.diverged:
             attempt.check()
 
     folder = TrialFolder(job.folder)
     yield from folder.log()[-1:]  # an earlier attempt may have died before it was judged
-    yield from run_trial(
-        problem,
-        job.parameters,
-        study.configuration._replace(training=training),
-        folder,
+    trial = Trial(
         stage=stage,
+        parameters=job.parameters,
         init_seed=job.init_seed,
         data_seed=study.seeds.data,
         provenance=provenance(study),
+    )
+    yield from run_trial(
+        problem,
+        trial,
+        study.configuration._replace(training=training),
+        folder,
         seconds_limit=_seconds_limit(study, training),
         on_update=check_before_writing,
     )

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 from cconv.evaluation.cost import flops_per_particle
 from cconv.models.checkpoint import read_card, save_model
@@ -9,20 +11,36 @@ from cconv.models.model import Model
 from cconv.study.declared.configuration import Configuration, TrainingConfig, configure
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.problem import Problem
-from cconv.training.loop import TrainingState, train
+from cconv.training.loop import Optimization, TrainingState, train
 from cconv.training.progress import Progress, begin, load_progress, save_progress
+from cconv.validation import Value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A configuration to train, and what its records say of it.
+
+    Attributes:
+        stage: Stage that it belongs to.
+        parameters: Hyperparameters that replace the study's own.
+        init_seed: Seed of the initial weights.
+        data_seed: Seed of the batch order.
+        provenance: Where the data come from, for the checkpoint's card.
+    """
+
+    stage: str
+    parameters: Mapping[str, Value]
+    init_seed: int
+    data_seed: int
+    provenance: Mapping[str, Any]
 
 
 def run_trial(
     problem: Problem,
-    parameters: Mapping,
+    trial: Trial,
     defaults: Configuration,
     folder: TrialFolder,
     *,
-    stage: str,
-    init_seed: int,
-    data_seed: int,
-    provenance: Mapping,
     seconds_limit: float = math.inf,
     on_update: Callable[[TrainingState], None] = lambda state: None,
 ) -> Iterator[dict]:
@@ -34,75 +52,58 @@ def run_trial(
 
     Args:
         problem: Scene, task and samples.
-        parameters: Hyperparameters that replace those of `defaults`.
+        trial: What is trained.
         defaults: What the study says where nothing is drawn.
         folder: Where config.json, log.jsonl, progress.safetensors and checkpoint/ are written.
-        stage: Stage that the trial belongs to.
-        init_seed: Seed of the initial weights.
-        data_seed: Seed of the batch order.
-        provenance: Where the data come from, for the checkpoint's card.
         seconds_limit: Time that the training may take in all; it ends at the first update after that.
         on_update: Sees the state after every update.
     """
-    configuration = configure(parameters, defaults)
+    configuration = configure(trial.parameters, defaults)
     training = configuration.training
-    model = problem.build_model(configuration, init_seed)
-    config = describe(problem, parameters, model, training, stage=stage, init_seed=init_seed, data_seed=data_seed)
+    model = problem.build_model(configuration, trial.init_seed)
+    config = describe(problem, trial, model, training)
     progress = _begin_or_go_on(model, folder, config)
-    card = config | dict(provenance)
+    card = config | dict(trial.provenance)
     best = _best_so_far(folder)
     states = train(
         model,
         problem.train_samples,
-        problem.valid_samples,
-        updates=training.updates,
-        evaluate_every=training.evaluate_every,
-        batch_size=training.batch_size,
-        learning_rate=training.learning_rate,
-        schedule=training.schedule,
-        data_seed=data_seed,
+        problem.valid_error,
+        Optimization(**training.model_dump(exclude={"cache_megabytes"})),
+        data_seed=trial.data_seed,
         cache_bytes=training.cache_megabytes * 2**20,
         progress=progress,
     )
     try:
         for state in states:
             on_update(state)
-            if state.valid_normalized_mse is None and not state.diverged:
+            if state.valid_error is None and not state.diverged:
                 if state.seconds > seconds_limit:
                     return
                 continue
             entry = _entry(state)
-            if not state.diverged and state.valid_normalized_mse < best:
-                best = state.valid_normalized_mse
-                save_model(model, folder.checkpoint, card | {"valid_normalized_mse": best, "updates": state.updates})
+            if not state.diverged and state.valid_error < best:
+                best = state.valid_error
+                save_model(model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
             folder.append(entry)
             save_progress(folder.progress, model, progress)
             yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
-            save_model(model, folder.checkpoint, card | {"valid_normalized_mse": None})
+            save_model(model, folder.checkpoint, card | {"valid_error": None})
         raise
 
 
-def describe(
-    problem: Problem,
-    parameters: Mapping,
-    model: Model,
-    training: TrainingConfig,
-    *,
-    stage: str,
-    init_seed: int,
-    data_seed: int,
-) -> dict:
-    """What config.json says of a model and its training before it begins; arguments as of `run_trial`."""
+def describe(problem: Problem, trial: Trial, model: Model, training: TrainingConfig) -> dict:
+    """What config.json says of a model and its training before it begins."""
     return {
-        "stage": stage,
-        "parameters": dict(parameters),
+        "stage": trial.stage,
+        "parameters": dict(trial.parameters),
         "features": list(model.config.features),
         "network": model.settings.model_dump(),
         "training": training.model_dump(),
-        "init_seed": init_seed,
-        "data_seed": data_seed,
+        "init_seed": trial.init_seed,
+        "data_seed": trial.data_seed,
         "num_parameters": model.num_parameters,
         "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
     }
@@ -119,7 +120,7 @@ def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progr
 
 def _best_so_far(folder: TrialFolder) -> float:
     """Validation error of the checkpoint of an earlier process; infinity where there is none."""
-    known = read_card(folder.checkpoint).get("valid_normalized_mse") if folder.progress.is_file() else None
+    known = read_card(folder.checkpoint).get("valid_error") if folder.progress.is_file() else None
     return math.inf if known is None else known
 
 
@@ -127,7 +128,7 @@ def _entry(state: TrainingState) -> dict:
     return {
         "updates": state.updates,
         "train_loss": _finite(state.train_loss),
-        "valid_normalized_mse": _finite(state.valid_normalized_mse),
+        "valid_error": _finite(state.valid_error),
         "learning_rate": state.learning_rate,
         "seconds": state.seconds,
         "diverged": state.diverged,

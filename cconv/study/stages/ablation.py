@@ -117,7 +117,7 @@ def _entry(session: Session, stage: str, change: str, parameters: Mapping) -> di
     return {
         "change": change,
         "parameters": dict(parameters),
-        "valid_normalized_mse": float(np.mean(errors)) if errors else None,
+        "valid_error": float(np.mean(errors)) if errors else None,
         "low": min(errors, default=None),
         "high": max(errors, default=None),
         "flops_per_particle": records[0].config["flops_per_particle"] if records else None,

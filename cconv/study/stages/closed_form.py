@@ -21,7 +21,6 @@ from cconv.data.splits import evenly_spaced
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import save_model
 from cconv.models.closed_form import solve_closed_form
-from cconv.models.errors import frame_errors, normalized_mse
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import OPTIONAL_FEATURES, configure
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
@@ -29,7 +28,7 @@ from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
 from cconv.study.records.trials import TrialFolder, TrialRecord, identity
 from cconv.study.running.problem import Problem, provenance
-from cconv.study.running.trial import describe
+from cconv.study.running.trial import Trial, describe
 from cconv.study.stages.jobs import trial_name
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
@@ -231,10 +230,8 @@ def _fit_and_record(
     model = problem.build_model(configuration, 0)
     untrained = configuration.training.model_copy(update={"updates": 0})
     seeds = {"init_seed": init_seed, "data_seed": study.seeds.data}
-    config = describe(problem, parameters, model, untrained, stage=stage, **seeds) | {
-        "closed_form": True,
-        "ridge": ridge,
-    }
+    trial = Trial(stage=stage, parameters=parameters, provenance=provenance(study), **seeds)
+    config = describe(problem, trial, model, untrained) | {"closed_form": True, "ridge": ridge}
     folder.start(config)
     train, valid = samples
     start = time.perf_counter()
@@ -243,20 +240,20 @@ def _fit_and_record(
     except ConfigError as error:
         folder.finish("failed", str(error))
         return
-    error = normalized_mse(frame_errors(model, valid))
+    error = problem.objective.error(model, valid)
     if not math.isfinite(error):
         folder.finish("failed", "its predictions are not finite")
         return
     entry = {
         "updates": 0,
         "train_loss": None,
-        "valid_normalized_mse": error,
+        "valid_error": error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
         "diverged": False,
     }
     folder.append(entry)
-    card = config | provenance(study) | {"valid_normalized_mse": entry["valid_normalized_mse"], "updates": 0}
+    card = config | dict(trial.provenance) | {"valid_error": entry["valid_error"], "updates": 0}
     save_model(model.eval(), folder.checkpoint, card)
     folder.finish("completed")
 

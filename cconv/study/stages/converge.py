@@ -48,7 +48,7 @@ class ConvergeStage(Stage):
 
         Returns:
             "finalists", the hyperparameters of the longest training of each model, by an id that ends in its updates;
-            and "convergence", by model: "points", an entry a budget ("id", "updates", "valid_normalized_mse", mean over
+            and "convergence", by model: "points", an entry a budget ("id", "updates", "valid_error", mean over
             the seeds, "by_seed", "train_seconds"), and "still_falling", whether the last budget still lowered the
             error.
         """
@@ -99,7 +99,7 @@ def _point(session: Session, finalist: str, updates: int) -> dict | None:
     return {
         "id": finalist,
         "updates": updates,
-        "valid_normalized_mse": float(np.mean(errors)),
+        "valid_error": float(np.mean(errors)),
         "by_seed": dict(zip([record.id for record in records], errors, strict=True)),
         "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in records])),
     }

@@ -11,10 +11,9 @@ from pydantic import Field
 
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
-from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
+from cconv.evaluation.objectives import Objective
 from cconv.evaluation.statistics import crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
-from cconv.models.errors import frame_errors, normalized_mse
 from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.stage import BASELINE, Stage
 from cconv.study.declared.study_file import StudyConfig
@@ -161,21 +160,23 @@ def retrained_finalists(
     return retrained, failed
 
 
-def evaluate_finalist(finalist: Retrained, samples: Sequence[Sample], frames_per_block: int) -> tuple[dict, np.ndarray]:
+def evaluate_finalist(
+    finalist: Retrained, objective: Objective, samples: Sequence[Sample], frames_per_block: int
+) -> tuple[dict, np.ndarray]:
     """Errors of a finalist on a split, over its seeds.
 
     Args:
         finalist: The finalist.
+        objective: What finalists are compared by.
         samples: Frames of the split.
         frames_per_block: Frames of a unit where the split has a single trajectory.
 
     Returns:
         What stands in summary.json, and the errors of each seed and unit (seeds, units).
     """
-    errors = [frame_errors(load_model(checkpoint), samples) for checkpoint in finalist.checkpoints]
-    by_seed = [normalized_mse(seed) for seed in errors]
-    per_frame = [per_frame_normalized_mse(seed) for seed in errors]
-    units = np.stack([blocks_of_errors(seed, frames_per_block) for seed in errors])
+    tables = [objective.table(load_model(each), samples, frames_per_block) for each in finalist.checkpoints]
+    by_seed, per_frame = [table.error for table in tables], [table.per_frame for table in tables]
+    units = np.stack([table.units for table in tables])
     mean = float(np.mean(by_seed))
     interval = crossed_interval(units)
     facts = {

@@ -16,7 +16,6 @@ from cconv.evaluation.explanation import error_distribution, explain
 from cconv.evaluation.probes import make_probes
 from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.models.checkpoint import load_model
-from cconv.models.errors import mean_predictor_error, normalized_mse
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.budget import budget_words
 from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
@@ -164,14 +163,20 @@ def _errors(
 ) -> tuple[dict[str, dict], dict[str, np.ndarray]]:
     """Errors of each finalist on a split, as facts and by (seeds, units)."""
     frames = session.study.finalists.frames_per_block
-    both = {each.id: evaluate_finalist(each, samples, frames) for each in session.progress(finalists, label)}
+    both = {
+        each.id: evaluate_finalist(each, session.problem.objective, samples, frames)
+        for each in session.progress(finalists, label)
+    }
     return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
 
 
 def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> dict[str, float]:
     """What a model must be below on each split to know anything: the error of predicting the training mean there."""
-    train, splits = session.problem.train_samples, {"valid": session.problem.valid_samples, "test": test_samples}
-    return {split: normalized_mse(mean_predictor_error(samples, train)) for split, samples in splits.items()}
+    problem = session.problem
+    splits = {"valid": problem.valid_samples, "test": test_samples}
+    return {
+        split: problem.objective.of_mean_predictor(samples, problem.train_samples) for split, samples in splits.items()
+    }
 
 
 def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:

@@ -6,7 +6,7 @@ from cconv.study.records.trials import TrialRecord
 
 def record(errors, every=10):
     log = [
-        {"updates": every * number, "valid_normalized_mse": error, "seconds": 1.0}
+        {"updates": every * number, "valid_error": error, "seconds": 1.0}
         for number, error in enumerate(errors, start=1)
     ]
     return TrialRecord(
@@ -15,7 +15,7 @@ def record(errors, every=10):
 
 
 def point(name, updates, error):
-    return {"id": name, "updates": updates, "valid_normalized_mse": error}
+    return {"id": name, "updates": updates, "valid_error": error}
 
 
 def test_the_fall_is_that_of_the_best_error_in_the_last_quarter_of_the_updates():
