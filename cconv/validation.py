@@ -132,13 +132,30 @@ def _written_path(values: object, location: Sequence[str | int], is_missing: boo
     """The location without the names of union members, which stand in no file."""
     path = []
     for place, part in enumerate(location, start=1):
-        known = range(len(values)) if isinstance(values, list | tuple) else values
-        if isinstance(known, range | Mapping) and part in known:
-            values = values[part]
-        elif not (is_missing and place == len(location)):
-            continue
+        try:
+            values = _inside(values, part)
+        except LookupError:
+            if not (is_missing and place == len(location)):
+                continue
         path.append(part)
     return path
+
+
+def _inside(values: object, part: str | int) -> object:
+    """What stands in a table or list at a key, a place, or a path that is written with dots.
+
+    Raises:
+        LookupError: If nothing does.
+    """
+    if isinstance(values, Mapping) and isinstance(part, str):
+        if part in values:
+            return values[part]
+        name, dot, rest = part.partition(".")
+        if dot:
+            return _inside(values[name], rest)
+    if isinstance(values, list | tuple) and isinstance(part, int):
+        return values[part]
+    raise KeyError(part)
 
 
 def _known_keys(model: type[BaseModel], path: Iterable[str]) -> list[str]:

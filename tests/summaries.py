@@ -52,7 +52,7 @@ def whole_summary(summary: dict) -> dict:
                 "valid_error": 0.002,
                 "of": 0.001,
                 "flops_per_particle": 900.0,
-                "parameters": {"walls": True},
+                "parameters": {"task.features.walls": True},
             },
             {"left_out": "density", "valid_error": None, "of": 0.001, "flops_per_particle": None},
         ],
@@ -67,7 +67,7 @@ def whole_summary(summary: dict) -> dict:
         "comparisons": [_comparison(name, number) for number, name in enumerate(ids)],
         "retrained": {"normalized_mse": 0.0321, "choices": {ids[0]: 4, ids[1]: 1}},
     }
-    whole["refined"] = {"layers": "narrowed to 1 and 2: no better trial has more"}
+    whole["refined"] = {"network.layers": "narrowed to 1 and 2: no better trial has more"}
     for entry in whole["finalists"]:
         entry["stability"] = stability(entry["test"]["normalized_mse"])
     return whole
@@ -158,7 +158,7 @@ def _search_points() -> list[dict]:
             "measured": stage == "closed_form",
             "num_parameters": 100 * number + 7,
             "outcome": "completed" if stage == "closed_form" else outcomes[number % 3],
-            "parameters": {"layers": 2, "window": "poly6", "learning_rate": 0.0012345},
+            "parameters": {"network.layers": 2, "network.window": "poly6", "training.learning_rate": 0.0012345},
         }
         for stage in ("closed_form", "random", "second look")
         for number in range(5)
@@ -186,7 +186,11 @@ def _importance(updates: int) -> dict:
     constant = weak | dict.fromkeys(("share", "low", "high", "p_value"))
     facts = {"updates": updates, "trials": 16, "censored": True, "clipped": 0, "why_none": ""}
     measured = {"detectable_share": 0.62, "surrogate_r2": 0.7, "best_share": 0.3}
-    return facts | measured | {"parameters": {"layers": found, "window": weak, "message": constant}}
+    return (
+        facts
+        | measured
+        | {"parameters": {"network.layers": found, "network.window": weak, "network.message": constant}}
+    )
 
 
 def _unknown_importance(updates: int) -> dict:

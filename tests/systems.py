@@ -9,7 +9,7 @@ from cconv.domain import Box
 from cconv.models.model import Model, build_model
 from cconv.networks import ARCHITECTURES
 from cconv.sph.kernels import CubicSpline
-from cconv.study.declared.configuration import DEFAULTS, Configuration, configure
+from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
 from cconv.tasks.samples import Sample, make_sample
@@ -102,15 +102,16 @@ def problem(generator: torch.Generator, task: str = "density_rate") -> Problem:
     )
 
 
-def configured(**parameters) -> Configuration:
-    """The published network with all features, and some hyperparameters in place of its own.
+def configured(given: Configuration = DEFAULTS, /, **parameters) -> Configuration:
+    """A configuration, by default the published one, with some hyperparameters, named by the ends of their paths.
 
     Those of another architecture are left out, so that one call serves all architectures.
     """
-    architecture = parameters.get("architecture", "conv_net")
+    architecture = parameters.get("architecture", given.network.architecture)
     foreign = {name for settings in ARCHITECTURES.values() for name in settings.model_fields}
     foreign -= {*ARCHITECTURES[architecture].model_fields}
-    return configure({name: value for name, value in parameters.items() if name not in foreign}, DEFAULTS)
+    paths = {path.rpartition(".")[2]: path for path in HYPERPARAMETERS}
+    return configure({paths[name]: value for name, value in parameters.items() if name not in foreign}, given)
 
 
 def model_of(

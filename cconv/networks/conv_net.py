@@ -226,6 +226,9 @@ class ConvNetSettings(ConvolutionSettings):
     R = 2.25 spacings). Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
     """
 
+    basis_size = "kernel_size"
+    linear_settings = (*ConvolutionSettings.linear_settings, basis_size, "mapping", "interpolation", "align_corners")
+
     architecture: Literal["conv_net"] = "conv_net"
     kernel_size: Whole = Field(4, ge=1, le=32)
     mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (

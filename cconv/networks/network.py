@@ -1,7 +1,7 @@
 """What every network has: settings that build it, its geometry, its counted cost, and, if linear, its terms."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -122,6 +122,9 @@ class NetworkSettings(StrictModel, ABC):
     """
 
     is_equivariant: ClassVar[bool] = False  # to rotations and reflections, whatever its weights
+    linear_with: ClassVar[Mapping[str, int]] = {}  # settings that make it linear in its coefficients, where some do
+    linear_settings: ClassVar[tuple[str, ...]] = ()  # further settings that matter then
+    basis_size: ClassVar[str]  # the one of them that says how many basis functions a filter has
 
     architecture: str
     relative_cutoff: Real = Field(2.25, ge=1e-3, le=10)
@@ -164,6 +167,9 @@ class ConvolutionSettings(NetworkSettings):
 
     The layers have `first_channels`, then `hidden_channels`, and the components of the target.
     """
+
+    linear_with = {"layers": 1}
+    linear_settings = ("relative_cutoff", "window", "normalize", "message")
 
     layers: Whole = Field(4, ge=1, le=16)
     first_channels: Whole = Field(32, ge=1, le=4096)

@@ -240,6 +240,8 @@ class RadialNetSettings(ConvolutionSettings):
     """Hyperparameters of a `RadialNet`, each of whose hidden layers has so many scalars and as many vectors."""
 
     is_equivariant = True
+    basis_size = "radial_terms"
+    linear_settings = (*ConvolutionSettings.linear_settings, basis_size)
 
     architecture: Literal["radial_net"] = "radial_net"
     radial_terms: Whole = Field(16, ge=1, le=512)

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
+from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
 from cconv.study.declared.search_space import check_baseline_affordable
 from cconv.study.declared.stage import Stage, Trials, readers_of
@@ -144,7 +145,7 @@ def _session(
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
-        space = fixed(space, WALLS)  # nothing to search where there are no walls
+        space = fixed(space, feature_path(WALLS))  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
     searches = [name for name, stage in study.stages.items() if isinstance(stage, SearchStage)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from systems import model_of, periodic_frame, periodic_scene, with_walls
+from systems import configured, model_of, periodic_frame, periodic_scene, with_walls
 
 import cconv
 from cconv.data.trajectory import Boundary
@@ -16,7 +16,6 @@ from cconv.models.checkpoint import load_model, save_model
 from cconv.models.model import build_model
 from cconv.networks import ARCHITECTURES
 from cconv.networks.network import NetworkSettings
-from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.samples import make_sample
 from cconv.tasks.task import FieldTask
@@ -47,10 +46,8 @@ def walled_frame(generator):
 def fresh(task, architecture, generator, **changes):
     """A small model with weights that are nowhere 0, and the frame that it was standardised by."""
     sizes = {"layers": 2, "first_channels": 4, "kernel_size": 3, "radial_terms": 5, "activation": "tanh"}
-    of_network = ARCHITECTURES[architecture].model_fields
-    parameters = {name: value for name, value in (sizes | changes).items() if name in of_network}
     scene, frame = periodic_scene(), walled_frame(generator)
-    configuration = configure({"architecture": architecture} | parameters, DEFAULTS)
+    configuration = configured(**{"architecture": architecture} | sizes | changes)
     model = model_of(configuration, scene, task, [make_sample(frame, scene, task_named(task))], generator)
     with torch.no_grad():
         for parameter in model.parameters():

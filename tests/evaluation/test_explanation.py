@@ -9,7 +9,6 @@ from systems import configured, kernel, model_of, periodic_frame, periodic_scene
 
 from cconv.evaluation.explanation import error_distribution, explain, first_layer_filters
 from cconv.models.closed_form import solve_closed_form
-from cconv.study.declared.configuration import configure
 from cconv.tasks import task_named
 from cconv.tasks.features import Features
 from cconv.tasks.samples import make_sample
@@ -74,7 +73,7 @@ def test_analytic_filters_are_the_printed_formulas(generator):
 def test_a_layer_answers_with_its_filters(generator):
     """A grid of one cell is the window times the same weights at every place, in the units of the data."""
     samples = samples_of(generator, "density_rate", 1)
-    model = built(configure({"kernel_size": 1}, GRID), samples)
+    model = built(configured(GRID, kernel_size=1), samples)
     filters = first_layer_filters(model, samples[0])
     inside = (1 - (filters["line"] / model.cutoff) ** 2).clip(0) ** 3
     weights = model.network.convs[0].filters.detach().double()[0, 0]
@@ -101,8 +100,7 @@ def test_radial_filters_are_the_same_in_all_directions_and_grids_are_not(generat
 def test_normalised_filters_are_divided_by_the_mean_sum_of_windows(generator):
     samples = samples_of(generator, "density_rate", 1)
     plain, normalized = (
-        first_layer_filters(built(configure({"normalize": value}, GRID), samples), samples[0])
-        for value in (False, True)
+        first_layer_filters(built(configured(GRID, normalize=value), samples), samples[0]) for value in (False, True)
     )
     ratio = plain["learned_on_axes"] / np.where(normalized["learned_on_axes"] == 0, 1, normalized["learned_on_axes"])
     sums = ratio[ratio != 0]
@@ -114,7 +112,7 @@ def test_normalised_filters_are_divided_by_the_mean_sum_of_windows(generator):
 def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(generator, architecture):
     samples = samples_of(generator, "density_rate", 1)
     wide = configured(layers=2, architecture=architecture, first_channels=24, hidden_channels=8, relative_cutoff=2.0)
-    narrow = configure({"first_channels": 1}, wide)
+    narrow = configured(wide, first_channels=1)
     found = [first_layer_filters(built(network, samples), samples[0]) for network in (narrow, wide)]
     assert all(filters["is_combined"] for filters in found)
     assert 0 <= found[1]["unexplained"] < found[0]["unexplained"] <= 1
@@ -122,7 +120,7 @@ def test_outputs_of_deeper_networks_are_combined_never_worse_than_nothing(genera
 
 def test_models_without_density_or_with_walls_are_explained(generator):
     samples = samples_of(generator, "density_rate", 1)
-    filters = first_layer_filters(built(configure({"density": False}, RADIAL), samples), samples[0])
+    filters = first_layer_filters(built(configured(RADIAL, density=False), samples), samples[0])
     assert abs(filters["learned_on_axes"][:, :, 1]).max() == 0
     ones = Features(scalars=torch.ones(7, 1), vectors=torch.zeros(7, 0, 2), scalar_names=("one",), vector_names=())
     walled = replace(

@@ -10,7 +10,6 @@ from cconv.models.checkpoint import load_model, save_model
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import build_model
 from cconv.nn.kinds import Kinds
-from cconv.study.declared.configuration import configure
 from cconv.tasks import task_named
 from cconv.tasks.samples import make_sample
 
@@ -117,7 +116,7 @@ def test_only_a_model_with_a_boundary_branch_sees_the_walls(network, layers, gen
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
     moved = with_moved_walls(frame)
     for walls in (True, False):
-        settings = configure({"walls": walls, "layers": layers}, network)
+        settings = configured(network, walls=walls, layers=layers)
         model = walled_model(settings, frame, generator)
         sees = not torch.equal(model.predict_frame(frame, scene), model.predict_frame(moved, scene))
         assert sees == walls
@@ -125,7 +124,7 @@ def test_only_a_model_with_a_boundary_branch_sees_the_walls(network, layers, gen
 
 def test_a_model_without_boundary_branch_takes_scenes_with_and_without_walls(generator):
     scene, frame = periodic_scene(), periodic_frame(generator)
-    model = walled_model(configure({"walls": False}, SMALL), with_walls(frame), generator)
+    model = walled_model(configured(SMALL, walls=False), with_walls(frame), generator)
     assert model.config.walls is None
     walled, bare = (model.predict_frame(each, scene) for each in (with_walls(frame), frame))
     assert torch.equal(walled, bare)
@@ -137,7 +136,7 @@ def test_only_a_model_with_the_density_feature_sees_the_masses(network, layers, 
     scene, frame = periodic_scene(), with_walls(periodic_frame(generator))
     heavier = replace(frame, masses=frame.masses * torch.tensor([0.875, 1.125]).repeat(32))  # of the same mean
     for density in (True, False):
-        settings = configure({"density": density, "layers": layers}, network)
+        settings = configured(network, density=density, layers=layers)
         model = walled_model(settings, frame, generator)
         sees = not torch.equal(model.predict_frame(frame, scene), model.predict_frame(heavier, scene))
         assert sees == density
@@ -148,7 +147,7 @@ def test_a_model_without_density_takes_inputs_with_and_without_it(network, gener
     scene, frame = periodic_scene(), periodic_frame(generator)
     sample = make_sample(frame, scene, task_named("density_rate"))
     bare = task_named("density_rate").inputs(frame, scene, ("one", "velocity"))
-    model = walled_model(configure({"density": False}, network), frame, generator)
+    model = walled_model(configured(network, density=False), frame, generator)
     assert torch.equal(model.predict(sample.inputs), model.predict(bare))
     with pytest.raises(ShapeError, match="takes the feature 'density', and the inputs hold one, velocity"):
         walled_model(network, frame, generator).predict(bare)
@@ -159,7 +158,7 @@ def test_what_is_switched_off_has_no_parameters(generator):
     frame = with_walls(periodic_frame(generator))
 
     def count(network, **switches):
-        return walled_model(configure(switches, network), frame, generator).num_parameters
+        return walled_model(configured(network, **switches), frame, generator).num_parameters
 
     (grid, radial), (of_grid, of_radial) = BASES, (each.network for each in BASES)
     cells, first = of_grid.kernel_size**2, of_grid.first_channels

@@ -26,5 +26,5 @@ def test_the_detectable_share_is_rounded_up(entries, share, percent):
 def test_only_what_was_found_is_named(entries):
     judged = {name: each | {"decided": False} for name, each in entries[1]["parameters"].items()}
     known, unknown = decidable({"importance": [entries[1], entries[1] | {"parameters": judged}]})
-    assert known.endswith("Found: layers (40 %, 95 % interval 30 to 50 %).")
+    assert known.endswith("Found: network.layers (40 %, 95 % interval 30 to 50 %).")
     assert unknown.endswith("Found: none.")

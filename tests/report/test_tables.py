@@ -39,7 +39,9 @@ def summary():
 def test_trials_table_has_a_row_a_trial_and_its_hyperparameters(run):
     table = trials_table(run)
     assert list(table["trial"]) == [record.id for record in run.trials()]
-    assert {"kernel_size", "message", "learning_rate", "outcome", "num_parameters"} <= set(table.columns)
+    assert {"network.kernel_size", "network.message", "training.learning_rate", "outcome", "num_parameters"} <= set(
+        table.columns
+    )
 
 
 def test_curves_table_has_a_row_an_evaluation(run):
@@ -105,7 +107,7 @@ def test_optional_tables_have_a_row_a_record_and_are_empty_without(summary):
 def test_importances_have_a_row_a_rung_and_hyperparameter_where_they_are_known(summary):
     table = importance_table(summary)
     assert list(table["updates"]) == [45, 45, 45, 135, 135, 135]
-    assert list(table["hyperparameter"])[:3] == ["layers", "window", "message"]
+    assert list(table["hyperparameter"])[:3] == ["network.layers", "network.window", "network.message"]
     tested = table[table["share"].notna()]
     assert (tested["low"] <= tested["share"]).all()
     assert (tested["share"] <= tested["high"]).all()

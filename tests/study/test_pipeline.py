@@ -184,7 +184,7 @@ SPACE_WITH_FAILURES = """
 name = "failures"
 description = "Half of the cutoffs reach farther than half of the periodic box, which no neighbour search can do."
 
-[parameters.relative_cutoff]
+[parameters.network.relative_cutoff]
 type = "choice"
 values = [2.0, 6.0]
 baseline = 2.0
@@ -234,7 +234,7 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(cconv, flow_fold
     run = begin_search(tmp_path / "failures.toml", flow_folder, folder)
     run_study(run, Silent(), serial=True)
     failed = [record for record in run.trials() if record.outcome == "failed"]
-    assert {record.parameters["relative_cutoff"] for record in failed} == {6.0}
+    assert {record.parameters["network.relative_cutoff"] for record in failed} == {6.0}
     assert all("half of every periodic axis" in record.reason for record in failed)
     counts = run.read("summary.json")["trials"]
     assert counts["random"]["failed"] + counts["adaptive"]["failed"] == len(failed) >= 1

@@ -9,17 +9,21 @@ from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.networks import ARCHITECTURES, ConvNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.sph.kernels import KERNELS
+from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
 from cconv.validation import Length, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
-TRAINING_HYPERPARAMETERS = ("batch_size", "learning_rate", "schedule")
+NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
+ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
-NETWORK_HYPERPARAMETERS = tuple(
-    dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
+_OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
+HYPERPARAMETERS = (
+    *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
+    *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
+    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule")),
 )
-HYPERPARAMETERS = (*NETWORK_HYPERPARAMETERS, *OPTIONAL_FEATURES, *TRAINING_HYPERPARAMETERS)
 
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 
@@ -84,38 +88,39 @@ class Configuration(NamedTuple):
 DEFAULTS = Configuration(TASKS["density_rate"].features, ConvNetSettings(), TrainingConfig())
 
 
-def check_known(parameters: Mapping[str, Value]) -> None:
-    """Raise `ConfigError` unless all names are those of hyperparameters."""
-    for name in parameters:
-        if name not in HYPERPARAMETERS:
-            raise ConfigError(
-                f"unknown hyperparameter {shown(name)}.{did_you_mean(name, HYPERPARAMETERS)} "
-                f"Known: {', '.join(HYPERPARAMETERS)}."
-            )
+def known_hyperparameters(name: str) -> str:
+    """The hyperparameter that an unknown name may stand for, and all that there are, for a message."""
+    nearest = [path for path in HYPERPARAMETERS if path.rpartition(".")[2] == name]
+    meant = f" Did you mean {nearest[0]!r}?" if nearest else did_you_mean(name, HYPERPARAMETERS)
+    return f"{meant} Known: {', '.join(HYPERPARAMETERS)}."
+
+
+def feature_path(name: str) -> str:
+    """Path of the hyperparameter that says whether networks are given an optional feature."""
+    return f"{FEATURES}.{name}"
 
 
 def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Configuration:
     """The drawn hyperparameters in place of the study's own.
 
-    An optional feature is named with whether it is taken. Where another architecture than the study's is drawn, the
-    study's settings that it does not have fall away.
+    Hyperparameters are paths into the study file; an optional feature is named with whether it is taken. Where another
+    architecture than the study's is drawn, the study's settings that it does not have fall away.
 
     Raises:
-        ConfigError: If they are not possible together.
+        ConfigError: If a name is not that of a hyperparameter, or they are not possible together.
     """
+    _check_known(parameters)
     _check_named(parameters)
-    features = set(defaults.features) | {name for name in OPTIONAL_FEATURES if parameters.get(name)}
-    features -= {name for name in OPTIONAL_FEATURES if parameters.get(name) is False}
-    architecture = parameters.get("architecture", defaults.network.architecture)
-    drawn = {name: value for name, value in parameters.items() if name not in OPTIONAL_FEATURES}
-    of_training = {name: drawn.pop(name) for name in TRAINING_HYPERPARAMETERS if name in drawn}
+    taken, drawn = below(FEATURES, parameters), below(NETWORK, parameters)
+    features = dict.fromkeys((*defaults.features, *(name for name in OPTIONAL_FEATURES if taken.get(name))))
+    architecture = drawn.get("architecture", defaults.network.architecture)
+    settings = ARCHITECTURES[architecture]
+    kept = {name: value for name, value in defaults.network.model_dump().items() if name in settings.model_fields}
     try:
-        settings = ARCHITECTURES[architecture]
-        kept = {name: value for name, value in defaults.network.model_dump().items() if name in settings.model_fields}
         return Configuration(
-            tuple(name for name in dict.fromkeys((*defaults.features, *OPTIONAL_FEATURES)) if name in features),
+            tuple(name for name in features if taken.get(name, True)),
             settings.model_validate(kept | drawn),
-            TrainingConfig.model_validate(defaults.training.model_dump() | of_training),
+            TrainingConfig.model_validate(defaults.training.model_dump() | below(TRAINING, parameters)),
         )
     except ValidationError as error:
         problem = error.errors()[0]
@@ -125,11 +130,18 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
         raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
 
 
+def _check_known(parameters: Mapping[str, Value]) -> None:
+    """Check that all names are paths of hyperparameters."""
+    for name in parameters:
+        if name not in HYPERPARAMETERS:
+            raise ConfigError(f"unknown hyperparameter {shown(name)}.{known_hyperparameters(name)}")
+
+
 def _check_named(parameters: Mapping[str, Value]) -> None:
     """Check what names an architecture or a feature."""
-    architecture = parameters.get("architecture")
+    architecture = parameters.get(ARCHITECTURE)
     if architecture is not None and architecture not in ARCHITECTURES:
-        raise ConfigError(f"not possible (architecture: must be one of {', '.join(ARCHITECTURES)})")
-    for name in OPTIONAL_FEATURES:
-        if not isinstance(parameters.get(name, True), bool):
-            raise ConfigError(f"not possible ({name}: must be true or false)")
+        raise ConfigError(f"not possible ({ARCHITECTURE}: must be one of {', '.join(ARCHITECTURES)})")
+    for path in map(feature_path, OPTIONAL_FEATURES):
+        if not isinstance(parameters.get(path, True), bool):
+            raise ConfigError(f"not possible ({path}: must be true or false)")

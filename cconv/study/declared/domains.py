@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cconv.errors import did_you_mean, shown
+from cconv.study.declared.paths import by_path, is_table_of_tables
 from cconv.validation import LARGEST_VALUE, Real, StrictModel, Text, Value, Whole
 
 MOST_VALUES = 100  # of a choice, or of a condition
@@ -31,6 +32,11 @@ class _Parameter(StrictModel):
 
     reason: Text
     when: dict[str, _Values] = Field({}, max_length=MOST_VALUES)
+
+    @field_validator("when", mode="before")
+    @classmethod
+    def _conditions_by_path(cls, when: object) -> object:
+        return by_path(when) if isinstance(when, Mapping) else when
 
 
 class Choice(_Parameter):
@@ -116,6 +122,11 @@ class SearchSpace(StrictModel):
     max_flops_per_particle: Real | None = Field(None, gt=0, le=1e18)
     max_bytes_per_particle: Real | None = Field(None, gt=0, le=1e18)
     parameters: dict[str, Parameter] = Field(min_length=1, max_length=MOST_VALUES)
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _parameters_by_path(cls, parameters: object) -> object:
+        return by_path(parameters, is_table_of_tables) if isinstance(parameters, Mapping) else parameters
 
     @model_validator(mode="after")
     def _conditions_can_hold(self) -> "SearchSpace":
@@ -210,7 +221,7 @@ def narrowed(space: SearchSpace, domains: Mapping[str, Parameter]) -> SearchSpac
 
 
 def fixed(space: SearchSpace, name: str) -> SearchSpace:
-    """The space with one parameter held at its baseline, e.g. "walls" in a scene without walls."""
+    """The space with one parameter held at its baseline, e.g. whether walls are seen in a scene without walls."""
     if name not in space.parameters:
         return space
     parameter = space.parameters[name]

@@ -4,18 +4,21 @@ import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from cconv.errors import ConfigError, did_you_mean, shown
+from cconv.errors import ConfigError, shown
 from cconv.files import read_toml
 from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import (
+    ARCHITECTURE,
     DEFAULTS,
     HYPERPARAMETERS,
-    NETWORK_HYPERPARAMETERS,
+    NETWORK,
     Configuration,
     configure,
+    known_hyperparameters,
 )
 from cconv.study.declared.domains import SearchSpace, Value
+from cconv.study.declared.paths import below
 from cconv.study.declared.study_file import StudyConfig
 from cconv.validation import validated
 
@@ -50,10 +53,7 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
     defaults = study.configuration if study else DEFAULTS
     for name, parameter in space.parameters.items():
         if name not in HYPERPARAMETERS:
-            raise ConfigError(
-                f"{source}: unknown hyperparameter `parameters.{name}`.{did_you_mean(name, HYPERPARAMETERS)} "
-                f"Known: {', '.join(HYPERPARAMETERS)}."
-            )
+            raise ConfigError(f"{source}: unknown hyperparameter `parameters.{name}`.{known_hyperparameters(name)}")
         for value in parameter.extremes:
             values = space.making_active(name) | {name: value}
             _check_configures(values, defaults, f"{source}: `parameters.{name}`: the value {shown(value)}")
@@ -63,15 +63,15 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
 
 def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -> None:
     """Check that a setting of some architectures alone is active with these alone."""
-    searched = space.parameters.get("architecture")
+    searched = space.parameters.get(ARCHITECTURE)
     for architecture in getattr(searched, "values", ()):
-        foreign = {*NETWORK_HYPERPARAMETERS} - {*ARCHITECTURES[architecture].model_fields}
-        for name in [name for name in space.parameters if name in foreign]:
-            if space.is_active(name, space.making_active(name) | {"architecture": architecture}):
-                owners = [each for each, settings in ARCHITECTURES.items() if name in settings.model_fields]
+        for setting in below(NETWORK, space.parameters).keys() - ARCHITECTURES[architecture].model_fields.keys():
+            name = f"{NETWORK}.{setting}"
+            if space.is_active(name, space.making_active(name) | {ARCHITECTURE: architecture}):
+                owners = [each for each, settings in ARCHITECTURES.items() if setting in settings.model_fields]
                 raise ConfigError(
                     f"{source}: `parameters.{name}`: is no setting of {architecture}, which the space searches too; "
-                    f"give it `when = {{ architecture = {json.dumps(owners)} }}`."
+                    f"give it `when = {{ {ARCHITECTURE} = {json.dumps(owners)} }}`."
                 )
 
 

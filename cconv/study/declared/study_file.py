@@ -14,7 +14,6 @@ from cconv.study.declared.configuration import (
     TaskConfig,
     TrainingConfig,
     Updates,
-    check_known,
     configure,
 )
 from cconv.study.declared.stage import Stage, check_names, check_order, included
@@ -168,7 +167,6 @@ class StudyConfig(StrictModel):
     def _included_are_possible(self) -> "StudyConfig":
         for finalist, parameters in included(self.stages):
             try:
-                check_known(parameters)
                 configure(parameters, self.configuration)
             except ConfigError as error:
                 raise ValueError(f"finalist `{finalist}`: {error}") from error

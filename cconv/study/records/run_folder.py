@@ -14,7 +14,7 @@ from cconv.study.records.forms import FORMS, Result, Table, read_record
 from cconv.study.records.trials import KNOWN_BEFORE, TrialFolder, TrialRecord
 from cconv.validation import Id, check_setting
 
-FORMAT = 3  # of a run folder; another one is refused
+FORMAT = 4  # of a run folder; another one is refused
 
 _PART = re.compile(r"\..+-\d+(\.\w+)?")  # names of what is being written, which a kill leaves behind
 _FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from cconv.study.declared.configuration import configure
+from cconv.study.declared.configuration import configure, feature_path
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.stages.closed_form import fit_whole
 from cconv.study.stages.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
@@ -103,12 +103,12 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
 
 
 def toggled(session: Session, best: Retrained) -> dict[str, dict]:
-    """Hyperparameters of the best finalist with each branch or feature that the scene offers toggled, by its name."""
+    """Hyperparameters of the best finalist with each feature that the scene offers toggled, by the feature's name."""
     parameters = best.records[0].parameters
     features = configure(parameters, session.study.configuration).features
     optional = session.problem.task.optional
     offered = [name for name in optional if name != WALLS or session.problem.scene.has_boundary]
-    return {name: parameters | {name: name not in features} for name in offered}
+    return {name: parameters | {feature_path(name): name not in features} for name in offered}
 
 
 def _entry(session: Session, stage: str, change: str, parameters: Mapping) -> dict:

@@ -21,8 +21,9 @@ from cconv.data.splits import evenly_spaced
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import save_model
 from cconv.models.closed_form import solve_closed_form
+from cconv.networks import ARCHITECTURES
 from cconv.networks.network import NetworkSettings
-from cconv.study.declared.configuration import OPTIONAL_FEATURES, configure
+from cconv.study.declared.configuration import ARCHITECTURE, NETWORK, OPTIONAL_FEATURES, configure, feature_path
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
 from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
@@ -35,11 +36,6 @@ from cconv.tasks.samples import Sample
 from cconv.validation import Value, Whole
 
 MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
-_OF_ANY = ("architecture", "relative_cutoff", "window", "normalize", "message", *OPTIONAL_FEATURES)
-_OF_ARCHITECTURE = {
-    "conv_net": ("kernel_size", "mapping", "interpolation", "align_corners"),
-    "radial_net": ("radial_terms",),
-}
 
 
 class ClosedFormStage(Stage):
@@ -103,23 +99,33 @@ def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range
         network: Settings that the space does not vary.
         values_per_range: Values taken of a range of numbers.
     """
+    linear = {name: settings for name, settings in ARCHITECTURES.items() if settings.linear_with}
+    always = chain.from_iterable(_paths(settings.linear_with).items() for settings in linear.values())
+    single = {path: [value] for path, value in always}
+    matters = {ARCHITECTURE, *single, *chain.from_iterable(map(_applies, linear.values()))}
     drawn: list[dict] = [{}]
-    for name in space.parents_first:
-        values = [1] if name == "layers" else _values(space.parameters[name], values_per_range)
-        if name in ("layers", *_OF_ANY, *chain.from_iterable(_OF_ARCHITECTURE.values())):
-            choices = [{name: value} for value in values]
-            drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
+    for name in [name for name in space.parents_first if name in matters]:
+        values = single.get(name) or _values(space.parameters[name], values_per_range)
+        choices = [{name: value} for value in values]
+        drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
     layers: dict[str, dict] = {}
     for values in drawn:
-        architecture = values.get("architecture", network.architecture)
-        applies = (*_OF_ANY, *_OF_ARCHITECTURE[architecture])
-        layer = {
-            "layers": 1,
-            "architecture": architecture,
-            **{name: value for name, value in values.items() if name in applies},
-        }
-        layers.setdefault(identity(layer), layer)
+        architecture = values.get(ARCHITECTURE, network.architecture)
+        if settings := linear.get(architecture):
+            of_it = {path: value for path, value in values.items() if path in _applies(settings)}
+            layer = {**_paths(settings.linear_with), ARCHITECTURE: architecture, **of_it}
+            layers.setdefault(identity(layer), layer)
     return list(layers.values())
+
+
+def _paths(settings: Mapping[str, Value]) -> dict[str, Value]:
+    """Settings of a network by their paths."""
+    return {f"{NETWORK}.{name}": value for name, value in settings.items()}
+
+
+def _applies(settings: type[NetworkSettings]) -> set[str]:
+    """Paths of the hyperparameters that a single layer of an architecture has."""
+    return {*(f"{NETWORK}.{name}" for name in settings.linear_settings), *map(feature_path, OPTIONAL_FEATURES)}
 
 
 def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
@@ -138,15 +144,16 @@ def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]])
     First the winners with every other number of basis functions, which decides more than anything else; then the
     layers that differ from a winner in one setting. The most accurate winner comes first.
     """
-    with_other_terms = [layer for record in winners for layer in untried if _same_but_terms(record, layer)]
+    with_other_terms = [layer for record in winners for layer in untried if _same_but_basis_size(record, layer)]
     if with_other_terms:
         return list({identity(layer): layer for layer in with_other_terms}.values())
     return next(filter(None, (_neighbors(record.parameters, untried) for record in winners)), [])
 
 
-def _same_but_terms(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
+def _same_but_basis_size(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
     """Whether a layer differs from that of a record in the number of its basis functions alone."""
-    return "radial_terms" in layer and record.parameters | {"radial_terms": layer["radial_terms"]} == layer
+    path = f"{NETWORK}.{ARCHITECTURES[layer[ARCHITECTURE]].basis_size}"
+    return path in layer and record.parameters | {path: layer[path]} == layer
 
 
 def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
@@ -155,7 +162,7 @@ def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -
 
 
 def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[str, dict[str, Value]]:
-    """Fit the best candidates to the whole training split, without the branches and features that they do not need.
+    """Fit the best candidates to the whole training split, without the features that they do not need.
 
     Each is fitted once, as nothing in it is drawn.
 
@@ -165,7 +172,7 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
         seed: Seed that names the folder.
 
     Returns:
-        Hyperparameters of the finalists, by id; that of one that lost a branch says so.
+        Hyperparameters of the finalists, by id; that of one that lost a feature says so.
     """
     study, chosen = session.study, {}
     for name in reads_of(study.stages, stage):
@@ -195,9 +202,10 @@ def without_unneeded_features(
 
     finalist, parameters = candidate.id, candidate.parameters
     error = fitted(finalist, parameters)
-    for branch in OPTIONAL_FEATURES:
-        if parameters.get(branch) and False in session.space.parameters[branch].values:
-            leaner, fewer = f"{finalist}_no_{branch}", parameters | {branch: False}
+    for feature in OPTIONAL_FEATURES:
+        path = feature_path(feature)
+        if parameters.get(path) and False in session.space.parameters[path].values:
+            leaner, fewer = f"{finalist}_no_{feature}", parameters | {path: False}
             error_without = fitted(leaner, fewer)
             if error_without <= error * (1 + session.study.selection.margin):
                 finalist, parameters, error = leaner, fewer, error_without
@@ -264,8 +272,8 @@ def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[st
     rank = Counter()
     ranked = []
     for layer in drawn:
-        rank[layer["architecture"]] += 1
-        ranked.append((rank[layer["architecture"]], layer))
+        rank[layer[ARCHITECTURE]] += 1
+        ranked.append((rank[layer[ARCHITECTURE]], layer))
     chosen = [layer for _, layer in sorted(ranked, key=lambda item: item[0])[:count]]
     return [layer for layer in layers if layer in chosen]
 

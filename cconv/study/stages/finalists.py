@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
@@ -15,6 +15,7 @@ from cconv.evaluation.objectives import Objective
 from cconv.evaluation.statistics import crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.study.declared.configuration import TrainingConfig
+from cconv.study.declared.paths import by_path
 from cconv.study.declared.stage import BASELINE, Stage
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.evidence.budget import fall_at_the_end
@@ -80,6 +81,13 @@ class FinalistsStage(Stage):
     needs_records = True
     count: Whole = Field(3, ge=1, le=1000)
     include: dict[Name, dict[str, Value]] = Field({}, max_length=100)
+
+    @field_validator("include", mode="before")
+    @classmethod
+    def _hyperparameters_by_path(cls, include: object) -> object:
+        if not isinstance(include, Mapping):
+            return include
+        return {name: by_path(each) if isinstance(each, Mapping) else each for name, each in include.items()}
 
     @property
     def included(self) -> Mapping[str, dict[str, Value]]:

@@ -16,23 +16,35 @@ REPOSITORY = Path(__file__).parents[3]
 SPACES = sorted((REPOSITORY / "search_spaces").glob("*.toml"))
 
 HEAD = 'name = "mini"\ndescription = "For tests."\n'
-CHOICE = '[parameters.window]\ntype = "choice"\nvalues = ["none", "poly6"]\nbaseline = "poly6"\nreason = "r"\n'
-FLOAT = (
-    '[parameters.learning_rate]\ntype = "float"\nrange = [1e-4, 1e-2]\nscale = "log"\nbaseline = 1e-3\nreason = "r"\n'
-)
-INT = '[parameters.kernel_size]\ntype = "int"\nrange = [3, 6]\nbaseline = 4\nreason = "r"\n'
+CHOICE = '[parameters.network.window]\ntype = "choice"\nvalues = ["none", "poly6"]\nbaseline = "poly6"\nreason = "r"\n'
+FLOAT = """[parameters.training.learning_rate]
+type = "float"
+range = [1e-4, 1e-2]
+scale = "log"
+baseline = 1e-3
+reason = "r"
+"""
+INT = """[parameters.network.kernel_size]
+type = "int"
+range = [3, 6]
+baseline = 4
+reason = "r"
+"""
 
 
-ARCHITECTURE = """[parameters.architecture]
+ARCHITECTURE = """[parameters.network.architecture]
 type = "choice"
 values = ["conv_net", "radial_net"]
 baseline = "conv_net"
 reason = "r"
 """
-SKIP = (
-    '[parameters.skip]\ntype = "choice"\nvalues = ["after_activation"]\nbaseline = "after_activation"\nreason = "r"\n'
-)
-OF_GRID = 'when = { architecture = ["conv_net"] }\n'
+SKIP = """[parameters.network.skip]
+type = "choice"
+values = ["after_activation"]
+baseline = "after_activation"
+reason = "r"
+"""
+OF_GRID = 'when = { network.architecture = ["conv_net"] }\n'
 
 
 @pytest.fixture
@@ -61,12 +73,20 @@ def test_the_baseline_is_the_published_network_and_training(name):
 def conditional_space():
     """Kernel size on the grid only; mapping only for the larger two; terms on the radial architecture only."""
     parameters = {
-        "mapping": {"values": ["identity", "ball_to_cube_radial"], "when": {"kernel_size": [4, 5]}},
-        "kernel_size": {"type": "int", "range": [3, 5], "baseline": 4, "when": {"architecture": ["conv_net"]}},
-        "architecture": {"values": ["conv_net", "radial_net"]},
-        "radial_terms": {"values": [8, 16], "when": {"architecture": ["radial_net"]}},
-        "window": {"values": ["none", "poly6"], "when": {"architecture": ["conv_net"], "layers": [2]}},
-        "layers": {"values": [1, 2]},
+        "network.mapping": {"values": ["identity", "ball_to_cube_radial"], "when": {"network.kernel_size": [4, 5]}},
+        "network.kernel_size": {
+            "type": "int",
+            "range": [3, 5],
+            "baseline": 4,
+            "when": {"network.architecture": ["conv_net"]},
+        },
+        "network.architecture": {"values": ["conv_net", "radial_net"]},
+        "network.radial_terms": {"values": [8, 16], "when": {"network.architecture": ["radial_net"]}},
+        "network.window": {
+            "values": ["none", "poly6"],
+            "when": {"network.architecture": ["conv_net"], "network.layers": [2]},
+        },
+        "network.layers": {"values": [1, 2]},
     }
     for parameter in parameters.values():
         parameter.setdefault("type", "choice")
@@ -76,22 +96,25 @@ def conditional_space():
 
 
 ALL = {
-    "mapping": "identity",
-    "kernel_size": 4,
-    "architecture": "conv_net",
-    "radial_terms": 8,
-    "window": "none",
-    "layers": 2,
+    "network.mapping": "identity",
+    "network.kernel_size": 4,
+    "network.architecture": "conv_net",
+    "network.radial_terms": 8,
+    "network.window": "none",
+    "network.layers": 2,
 }
 
 
 @pytest.mark.parametrize(
     ("changes", "active"),
     [
-        ({}, {"mapping", "kernel_size", "architecture", "window", "layers"}),
-        ({"kernel_size": 3}, {"kernel_size", "architecture", "window", "layers"}),
-        ({"layers": 1}, {"mapping", "kernel_size", "architecture", "layers"}),
-        ({"architecture": "radial_net"}, {"architecture", "radial_terms", "layers"}),
+        ({}, {"network.mapping", "network.kernel_size", "network.architecture", "network.window", "network.layers"}),
+        (
+            {"network.kernel_size": 3},
+            {"network.kernel_size", "network.architecture", "network.window", "network.layers"},
+        ),
+        ({"network.layers": 1}, {"network.mapping", "network.kernel_size", "network.architecture", "network.layers"}),
+        ({"network.architecture": "radial_net"}, {"network.architecture", "network.radial_terms", "network.layers"}),
     ],
 )
 def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
@@ -103,15 +126,15 @@ def test_a_parameter_is_active_where_all_its_conditions_hold(changes, active):
 def test_parents_come_before_those_that_depend_on_them():
     order = conditional_space().parents_first
     assert sorted(order) == sorted(ALL)
-    assert order.index("architecture") < order.index("kernel_size") < order.index("mapping")
+    assert order.index("network.architecture") < order.index("network.kernel_size") < order.index("network.mapping")
 
 
 def test_the_baseline_holds_active_parameters_only():
     assert conditional_space().baseline == {
-        "mapping": "identity",
-        "kernel_size": 4,
-        "architecture": "conv_net",
-        "layers": 1,
+        "network.mapping": "identity",
+        "network.kernel_size": 4,
+        "network.architecture": "conv_net",
+        "network.layers": 1,
     }
 
 
@@ -119,48 +142,56 @@ def test_a_configuration_is_whole_and_in_its_domain():
     space = conditional_space()
     whole = space.active(ALL)
     assert space.holds(whole)
-    assert space.holds({"architecture": "radial_net", "radial_terms": 8, "layers": 1})
-    missing = {name: value for name, value in whole.items() if name != "mapping"}
-    for wrong in (ALL, missing, whole | {"kernel_size": 7}, whole | {"learning_rate": 1e-3}):
+    assert space.holds({"network.architecture": "radial_net", "network.radial_terms": 8, "network.layers": 1})
+    missing = {name: value for name, value in whole.items() if name != "network.mapping"}
+    for wrong in (ALL, missing, whole | {"network.kernel_size": 7}, whole | {"training.learning_rate": 1e-3}):
         assert not space.holds(wrong)
 
 
 def test_conditions_follow_a_narrower_domain():
     space = conditional_space()
-    small = narrowed(space, {"kernel_size": space.parameters["kernel_size"].model_copy(update={"range": (3, 4)})})
-    assert small.parameters["mapping"].when == {"kernel_size": [4]}
+    small = narrowed(
+        space, {"network.kernel_size": space.parameters["network.kernel_size"].model_copy(update={"range": (3, 4)})}
+    )
+    assert small.parameters["network.mapping"].when == {"network.kernel_size": [4]}
     grid = Choice(type="choice", values=["conv_net"], baseline="conv_net", reason="r")
-    assert narrowed(space, {"architecture": grid}).parameters.keys() == ALL.keys() - {"radial_terms"}
+    assert narrowed(space, {"network.architecture": grid}).parameters.keys() == ALL.keys() - {"network.radial_terms"}
 
 
 def test_a_fixed_parameter_keeps_its_baseline_and_what_depends_on_it():
-    space = fixed(conditional_space(), "layers")
-    assert space.parameters["layers"].values == [1]
-    assert "window" not in space.parameters
+    space = fixed(conditional_space(), "network.layers")
+    assert space.parameters["network.layers"].values == [1]
+    assert "network.window" not in space.parameters
     assert space.baseline == conditional_space().baseline
-    assert fixed(space, "walls") == space
+    assert fixed(space, "task.features.walls") == space
 
 
 def test_single_layers_hold_what_is_active_in_one():
     layers = single_layers(conditional_space(), DEFAULTS.network, 3)
-    grid = [layer for layer in layers if layer["architecture"] == "conv_net"]
-    assert [layer for layer in grid if layer["kernel_size"] == 3] == [
-        {"layers": 1, "architecture": "conv_net", "kernel_size": 3}
+    grid = [layer for layer in layers if layer["network.architecture"] == "conv_net"]
+    assert [layer for layer in grid if layer["network.kernel_size"] == 3] == [
+        {"network.layers": 1, "network.architecture": "conv_net", "network.kernel_size": 3}
     ]
     assert all(
-        set(layer) == {"layers", "architecture", "kernel_size", "mapping"} for layer in grid if layer["kernel_size"] > 3
+        set(layer) == {"network.layers", "network.architecture", "network.kernel_size", "network.mapping"}
+        for layer in grid
+        if layer["network.kernel_size"] > 3
     )
     assert len(grid) == 1 + 2 * 2  # no window: it takes two layers
-    radial = [layer for layer in layers if layer["architecture"] == "radial_net"]
-    assert radial == [{"layers": 1, "architecture": "radial_net", "radial_terms": terms} for terms in (8, 16)]
+    radial = [layer for layer in layers if layer["network.architecture"] == "radial_net"]
+    assert radial == [
+        {"network.layers": 1, "network.architecture": "radial_net", "network.radial_terms": terms} for terms in (8, 16)
+    ]
 
 
 def test_single_layers_of_the_density_space_are_distinct_configurations_with_all_switches():
     space = load_space(next(path for path in SPACES if path.stem == "density"))
     layers = single_layers(space, DEFAULTS.network, 2)
     assert len({repr(sorted(layer.items())) for layer in layers}) == len(layers)
-    assert all(space.holds(layer | {"learning_rate": 1e-3}) for layer in layers)
-    assert {(layer["walls"], layer["density"]) for layer in layers} == set(product([True, False], repeat=2))
+    assert all(space.holds(layer | {"training.learning_rate": 1e-3}) for layer in layers)
+    assert {(layer["task.features.walls"], layer["task.features.density"]) for layer in layers} == set(
+        product([True, False], repeat=2)
+    )
 
 
 def test_a_baseline_above_the_cap_is_refused():
@@ -181,49 +212,67 @@ def costing(flops):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (CHOICE.replace("window", "windw"), r"unknown hyperparameter `parameters\.windw`\. Did you mean 'window'"),
-        (CHOICE.replace("reason", "because"), "unknown key `parameters.window.because`"),
+        (CHOICE.replace("window", "windw"), r"`parameters\.network\.windw`\. Did you mean 'network\.window'"),
+        (CHOICE.replace("reason", "because"), "unknown key `parameters.network.window.because`"),
         (CHOICE.replace('baseline = "poly6"', 'baseline = "gauss"'), "baseline 'gauss' must be one of the values"),
-        (CHOICE.replace('"none"', '"nothing"'), "`parameters.window`: the value 'nothing' is not possible"),
+        (CHOICE.replace('"none"', '"nothing"'), "`parameters.network.window`: the value 'nothing' is not possible"),
         (FLOAT.replace("1e-3", "1.0"), r"baseline 1\.0 must lie in the range"),
         (FLOAT.replace("[1e-4, 1e-2]", "[1e-2, 1e-4]"), "lower end first"),
         (FLOAT.replace("[1e-4, 1e-2]", "[0.0, 1e-2]"), "positive on a log scale"),
         (INT.replace("[3, 6]", "[0, 6]"), "the value 0 is not possible"),
-        (INT.replace('"int"', '"integer"'), "parameters.kernel_size"),
+        (INT.replace('"int"', '"integer"'), "parameters.network.kernel_size"),
         ("", "`parameters` is missing"),
         ("max_flops_per_particle = 0.0\n" + CHOICE, "`max_flops_per_particle`: input should be greater than 0"),
-        (INT + OF_GRID, r"`parameters\.kernel_size\.when\.architecture`: names no parameter of the space"),
-        (INT + 'when = { architectures = ["conv_net"] }\n' + ARCHITECTURE, r"Did you mean 'architecture'"),
         (
-            INT + 'when = { architecture = ["gird"] }\n' + ARCHITECTURE,
-            r"architecture`: lists 'gird', which is not in the domain of 'architecture'",
+            INT + OF_GRID,
+            r"`parameters\.network\.kernel_size\.when\.network\.architecture`: names no parameter of the space",
+        ),
+        (INT + 'when = { architectures = ["conv_net"] }\n' + ARCHITECTURE, r"Did you mean 'network.architecture'"),
+        (
+            INT + 'when = { network.architecture = ["gird"] }\n' + ARCHITECTURE,
+            r"architecture`: lists 'gird', which is not in the domain of 'network.architecture'",
         ),
         (
-            INT + "when = { architecture = [] }\n" + ARCHITECTURE,
-            r"`parameters\.kernel_size\.when\.architecture`: list should have",
+            INT + "when = { network.architecture = [] }\n" + ARCHITECTURE,
+            r"`parameters\.network\.kernel_size\.when\.network\.architecture`: list should have",
         ),
-        (CHOICE + "when = { kernel_size = [7] }\n" + INT, r"when\.kernel_size`: lists 7, which is not in the domain"),
-        (CHOICE + "when = { learning_rate = [1e-3] }\n" + FLOAT, "'learning_rate' is a real number"),
-        (CHOICE + "when = { kernel_size = [4] }\n" + INT + 'when = { window = ["none"] }\n', "closes a circle of cond"),
+        (
+            CHOICE + "when = { network.kernel_size = [7] }\n" + INT,
+            r"when\.network\.kernel_size`: lists 7, which is not in the domain",
+        ),
+        (CHOICE + "when = { training.learning_rate = [1e-3] }\n" + FLOAT, "'training.learning_rate' is a real number"),
+        (
+            CHOICE + "when = { network.kernel_size = [4] }\n" + INT + 'when = { network.window = ["none"] }\n',
+            "closes a circle of cond",
+        ),
         (
             ARCHITECTURE + INT,
-            r'kernel_size`: is no setting of radial_net, .* `when = . architecture = \["conv_net"\] .`',
+            r'kernel_size`: is no setting of radial_net, .* `when = . network.architecture = \["conv_net"\] .`',
         ),
         (
             ARCHITECTURE.replace('= "conv_net"', '= "radial_net"') + SKIP,
             r"the baseline is not possible .skip: Input should be 'before_activation'",
         ),
-        (FLOAT.replace("1e-2]", "inf]"), r"`parameters\.learning_rate\.range\.1`: input should be a finite number"),
+        (
+            FLOAT.replace("1e-2]", "inf]"),
+            r"`parameters\.training\.learning_rate\.range\.1`: input should be a finite number",
+        ),
         (FLOAT.replace("1e-4", "1e-300"), r"the value 1e-300 is not possible"),
         (
             INT.replace("= 4", "= true"),
-            r"`parameters\.kernel_size\.baseline`: input should be a valid integer, got True",
+            r"`parameters\.network\.kernel_size\.baseline`: input should be a valid integer, got True",
         ),
         (INT.replace("[3, 6]", "[3, 100000000000]"), r"range\.1`: input should be less than or equal to 1000000000"),
-        (CHOICE.replace('["none",', "[nan,"), r"`parameters\.window\.values\.0`: must be true, false, a number"),
+        (
+            CHOICE.replace('["none",', "[nan,"),
+            r"`parameters\.network\.window\.values\.0`: must be true, false, a number",
+        ),
         (CHOICE.replace('"none"', ", ".join(f'"{n}"' for n in range(200))), "list should have at most 100 items"),
         ("max_flops_per_particle = inf\n" + CHOICE, "`max_flops_per_particle`: input should be a finite number"),
-        (CHOICE.replace('"r"', '"\\u001b[2J"'), "`parameters.window.reason`: a text must hold no control characters"),
+        (
+            CHOICE.replace('"r"', '"\\u001b[2J"'),
+            "`parameters.network.window.reason`: a text must hold no control characters",
+        ),
         ("x." * 100_000 + "x = 1\n" + CHOICE, "a key has more than 32 parts"),
     ],
 )
@@ -235,8 +284,8 @@ def test_what_does_not_fit_is_named(text, message, space_file):
 
 
 def test_true_is_no_one(space_file):
-    layers = '[parameters.layers]\ntype = "choice"\nvalues = [1, 2]\nbaseline = 1\nreason = "r"\n'
-    assert not load_space(space_file(layers)).holds({"layers": True})
+    layers = '[parameters.network.layers]\ntype = "choice"\nvalues = [1, 2]\nbaseline = 1\nreason = "r"\n'
+    assert not load_space(space_file(layers)).holds({"network.layers": True})
     with pytest.raises(ConfigError, match="baseline True must be one of"):
         load_space(space_file(layers.replace("baseline = 1", "baseline = true")))
 
@@ -246,15 +295,18 @@ def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
     study = load_study(REPOSITORY / "experiments" / "smoke.toml", ["network.skip=after_activation"])
     load_space(path)
     with pytest.raises(
-        ConfigError, match="`parameters.architecture`: the value 'radial_net' is not possible .skip: Input"
+        ConfigError, match="`parameters.network.architecture`: the value 'radial_net' is not possible .skip: Input"
     ):
         load_space(path, study)
 
 
 def test_layers_of_a_huge_space_are_drawn_without_listing_them():
     """2e13 layers, of which no more than a limit are ever held."""
-    choices = {"relative_cutoff": [1.5 + number / 100 for number in range(100)], "radial_terms": list(range(1, 101))}
-    for name in ("window", "mapping", "interpolation", "message", "normalize"):
+    choices = {
+        "network.relative_cutoff": [1.5 + number / 100 for number in range(100)],
+        "network.radial_terms": list(range(1, 101)),
+    }
+    for name in ("network.window", "network.mapping", "network.interpolation", "network.message", "network.normalize"):
         choices[name] = [f"{name}{number}" for number in range(50)]
     parameters = {
         name: {"type": "choice", "values": values, "baseline": values[0], "reason": "r"}
@@ -264,5 +316,5 @@ def test_layers_of_a_huge_space_are_drawn_without_listing_them():
     network = RadialNetSettings()
     layers = single_layers(space, network, 3)
     assert 1000 < len(layers) <= MOST_LAYERS
-    assert {layer["relative_cutoff"] for layer in layers} == set(choices["relative_cutoff"])
+    assert {layer["network.relative_cutoff"] for layer in layers} == set(choices["network.relative_cutoff"])
     assert layers == single_layers(space, network, 3)

@@ -55,7 +55,7 @@ def test_what_does_not_fit_is_named(stages, message):
 
 
 def test_a_stage_that_converges_names_finalists_that_are_sure_to_be_there():
-    stages = {"random": {}, "finalists": {"include": {"named": {"layers": 1}}}}
+    stages = {"random": {}, "finalists": {"include": {"named": {"network.layers": 1}}}}
     named = study(**stages, converge={"budgets": [10, 20], "of": ["baseline", "named"]}, select={}).stages
     assert reads_of(named, "select") == ["finalists", "converge"]
     with pytest.raises(ConfigError, match="names the finalist `random_0001`; it can name baseline, named"):

@@ -153,15 +153,15 @@ def test_names_that_could_be_taken_for_others_are_refused(stages, message, study
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ("{ layer = 2 }", "finalist `x`: unknown hyperparameter 'layer'. Did you mean 'layers'"),
-        ("{ layers = 99 }", r"finalist `x`: not possible .layers: Input should be less than or equal to 16"),
-        ("{ layers = true }", r"finalist `x`: not possible .layers: Input should be a valid integer"),
+        ("{ layers = 2 }", "finalist `x`: unknown hyperparameter 'layers'. Did you mean 'network.layers'"),
+        ("{ network.layers = 99 }", r"finalist `x`: not possible .layers: Input should be less than or equal to 16"),
+        ("{ network.layers = true }", r"finalist `x`: not possible .layers: Input should be a valid integer"),
         (
-            '{ architecture = "radial_net", skip = "after_activation" }',
+            '{ network.architecture = "radial_net", network.skip = "after_activation" }',
             "finalist `x`: not possible .skip: Input should be",
         ),
-        ("{ learning_rate = inf }", r"include\.x\.learning_rate`: must be true, false, a number"),
-        ("{ layers = [1] }", r"include\.x\.layers`: must be true, false, a number"),
+        ("{ training.learning_rate = inf }", r"include\.x\.training\.learning_rate`: must be true, false, a number"),
+        ("{ network.layers = [1] }", r"include\.x\.network\.layers`: must be true, false, a number"),
     ],
 )
 def test_an_included_configuration_is_checked_when_the_study_is_loaded(parameters, message, study_file):

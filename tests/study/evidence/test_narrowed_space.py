@@ -18,20 +18,23 @@ SPACE = SearchSpace.model_validate(
         "description": "For tests.",
         "max_flops_per_particle": 2e6,
         "parameters": {
-            "learning_rate": {"type": "float", "range": [1e-4, 1e-1], "scale": "log", "baseline": 3e-3, "reason": "r."},
-            "relative_cutoff": {"type": "float", "range": [1.0, 3.0], "baseline": 2.0, "reason": "r."},
-            "message": {
+            "training.learning_rate": {
+                "type": "float", "range": [1e-4, 1e-1], "scale": "log", "baseline": 3e-3, "reason": "r.",
+            },
+            "network.relative_cutoff": {"type": "float", "range": [1.0, 3.0], "baseline": 2.0, "reason": "r."},
+            "network.message": {
                 "type": "choice", "values": ["absolute", "difference"], "baseline": "difference", "reason": "r."
             },
-            "architecture": {
+            "network.architecture": {
                 "type": "choice", "values": ["conv_net", "radial_net"], "baseline": "conv_net", "reason": "r."
             },
-            "kernel_size": {
-                "type": "int", "range": [2, 12], "baseline": 7, "reason": "r.", "when": {"architecture": ["conv_net"]}
+            "network.kernel_size": {
+                "type": "int", "range": [2, 12], "baseline": 7, "reason": "r.",
+                "when": {"network.architecture": ["conv_net"]},
             },
-            "mapping": {
+            "network.mapping": {
                 "type": "choice", "values": ["identity", "ball_to_cube_radial"], "baseline": "identity", "reason": "r.",
-                "when": {"message": ["absolute"]},
+                "when": {"network.message": ["absolute"]},
             },
         },
     }
@@ -43,9 +46,9 @@ def error_of(parameters, message=10.0):
 
     `message` says how strongly the message acts on the logarithm.
     """
-    log = 4 * abs(math.log10(parameters["learning_rate"]) + 2.5) - 7
-    log += message * (parameters["message"] == "absolute")
-    return math.exp(log + 2 * abs(parameters.get("kernel_size", 9.7) - 7))
+    log = 4 * abs(math.log10(parameters["training.learning_rate"]) + 2.5) - 7
+    log += message * (parameters["network.message"] == "absolute")
+    return math.exp(log + 2 * abs(parameters.get("network.kernel_size", 9.7) - 7))
 
 
 def record_of(number, parameters, error, reached=FULL, outcome=None):
@@ -85,33 +88,38 @@ def unchanged(refined):
 @pytest.mark.parametrize("records_of", [records_of, asha_records])
 def test_ranges_close_in_on_the_known_optimum_and_what_has_no_influence_stays(records_of):
     refined, reasons = refine(SPACE, records_of(240, message=0), FULL)
-    low, high = refined.parameters["learning_rate"].range
+    low, high = refined.parameters["training.learning_rate"].range
     assert 1e-4 < low < 3e-3 < high < 1e-1
-    low, high = refined.parameters["kernel_size"].range
+    low, high = refined.parameters["network.kernel_size"].range
     assert 2 < low <= 7 <= high < 12
-    assert unchanged(refined) == {"relative_cutoff", "message", "architecture", "mapping"}
-    assert all("narrowed to" in reasons[name] for name in ("learning_rate", "kernel_size"))
+    assert unchanged(refined) == {
+        "network.relative_cutoff",
+        "network.message",
+        "network.architecture",
+        "network.mapping",
+    }
+    assert all("narrowed to" in reasons[name] for name in ("training.learning_rate", "network.kernel_size"))
     assert all("kept: no clear preference" in reasons[name] for name in unchanged(refined))
 
 
 @pytest.mark.parametrize("records_of", [records_of, asha_records])
 def test_a_value_that_the_best_do_not_use_goes(records_of):
     refined, reasons = refine(SPACE, records_of(240), FULL)
-    assert refined.parameters["message"].values == ["difference"]
-    assert "hardly use 'absolute' (0 of the best, 1" in reasons["message"]
-    assert {"relative_cutoff", "architecture"} <= unchanged(refined)
+    assert refined.parameters["network.message"].values == ["difference"]
+    assert "hardly use 'absolute' (0 of the best, 1" in reasons["network.message"]
+    assert {"network.relative_cutoff", "network.architecture"} <= unchanged(refined)
 
 
 def test_trials_are_compared_at_the_largest_budget_that_enough_reached():
     _, reasons = refine(SPACE, asha_records(240), FULL)
-    assert "the best 60 of 240 trials (80 compared at 30 of 90 updates)" in reasons["learning_rate"]
+    assert "the best 60 of 240 trials (80 compared at 30 of 90 updates)" in reasons["training.learning_rate"]
 
 
 def test_conditions_follow_what_is_left():
     refined, reasons = refine(SPACE, records_of(240), FULL)
-    assert "mapping" not in refined.parameters
-    assert reasons["mapping"] == "left out: nothing that is left of message makes it active"
-    assert refined.parameters["kernel_size"].when == {"architecture": ["conv_net"]}
+    assert "network.mapping" not in refined.parameters
+    assert reasons["network.mapping"] == "left out: nothing that is left of network.message makes it active"
+    assert refined.parameters["network.kernel_size"].when == {"network.architecture": ["conv_net"]}
 
 
 def test_the_refined_space_holds_the_best_trial_and_the_baseline():
@@ -125,15 +133,15 @@ def test_the_refined_space_holds_the_best_trial_and_the_baseline():
 
 def test_the_baseline_stays_even_where_the_evidence_is_against_it():
     parameters = dict(SPACE.parameters)
-    parameters["message"] = parameters["message"].model_copy(update={"baseline": "absolute"})
-    parameters["learning_rate"] = parameters["learning_rate"].model_copy(update={"baseline": 1e-4})
+    parameters["network.message"] = parameters["network.message"].model_copy(update={"baseline": "absolute"})
+    parameters["training.learning_rate"] = parameters["training.learning_rate"].model_copy(update={"baseline": 1e-4})
     space = SPACE.model_copy(update={"parameters": parameters})
     refined, reasons = refine(space, records_of(240), FULL)
-    assert refined.parameters["message"].values == ["absolute", "difference"]
-    assert "kept, as the baseline" in reasons["message"]
-    assert refined.parameters["learning_rate"].range[0] == 1e-4
-    assert refined.parameters["learning_rate"].range[1] < 1e-1
-    assert "the baseline" in reasons["learning_rate"]
+    assert refined.parameters["network.message"].values == ["absolute", "difference"]
+    assert "kept, as the baseline" in reasons["network.message"]
+    assert refined.parameters["training.learning_rate"].range[0] == 1e-4
+    assert refined.parameters["training.learning_rate"].range[1] < 1e-1
+    assert "the baseline" in reasons["training.learning_rate"]
 
 
 def test_thin_evidence_narrows_nothing():
@@ -159,7 +167,7 @@ def test_chance_alone_hardly_ever_narrows():
         refined, _ = refine(SPACE, records, FULL)
         changed += sum(
             refined.parameters[name].range != SPACE.parameters[name].range
-            for name in ("learning_rate", "relative_cutoff")
+            for name in ("training.learning_rate", "network.relative_cutoff")
         )
     assert changed <= 8  # 240 ends were judged; at 1 % each, more than 8 have a chance below 1e-3
 

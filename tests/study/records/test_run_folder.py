@@ -8,7 +8,7 @@ from cconv.study.records.run_folder import FORMAT, RunFolder
 
 CONFIG = {
     "stage": "random",
-    "parameters": {"kernel_size": 4},
+    "parameters": {"network.kernel_size": 4},
     "num_parameters": 12,
     "flops_per_particle": 9.0,
     "init_seed": 0,

@@ -2,16 +2,22 @@
 
 import numpy as np
 import pytest
-from systems import configured, problem
+from systems import problem
 
 from cconv.evaluation.cost import Cost, flops_per_particle
+from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.counted_costs import CostCounter, points_of_search
 from cconv.study.studies import Study
 
 STUDY = Study.model_validate({"name": "s", "task": "density_rate", "search": {"space": "s.toml"}})
 PARAMETERS = [
-    {"layers": layers, "first_channels": width, "hidden_channels": width, "relative_cutoff": cutoff}
+    {
+        "network.layers": layers,
+        "network.first_channels": width,
+        "network.hidden_channels": width,
+        "network.relative_cutoff": cutoff,
+    }
     for layers in (1, 2, 3)
     for width, cutoff in ((4, 1.5), (8, 2.0), (16, 2.5))
 ]
@@ -31,10 +37,13 @@ def cost(us_per_particle):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("parameters", [*PARAMETERS, {"architecture": "radial_net", "layers": 2}, {"density": False}])
+@pytest.mark.parametrize(
+    "parameters",
+    [*PARAMETERS, {"network.architecture": "radial_net", "network.layers": 2}, {"task.features.density": False}],
+)
 def test_the_count_is_that_of_the_built_model(generator, parameters):
     given = problem(generator)
-    model = given.build_model(configured(**parameters), 0)
+    model = given.build_model(configure(parameters, DEFAULTS), 0)
     counted = CostCounter(STUDY, given)(parameters).flops_per_particle
     assert counted == pytest.approx(flops_per_particle(model, given.valid_samples[0].inputs))
 

@@ -21,7 +21,7 @@ def trial(given, folder, parameters=None, **options):
 
 def test_log_config_and_checkpoint_agree(generator, tmp_path):
     given, folder = problem(generator), RunFolder(tmp_path).trial("random_0000")
-    entries = list(trial(given, folder, {"learning_rate": 0.02, "kernel_size": 4}))
+    entries = list(trial(given, folder, {"training.learning_rate": 0.02, "network.kernel_size": 4}))
     record = folder.read()
     assert record.log == entries
     assert [entry["updates"] for entry in entries] == [2, 4, 6]
@@ -40,7 +40,13 @@ def test_every_entry_is_on_disk_before_it_is_seen(generator, tmp_path):
 def test_divergence_is_a_recorded_outcome(generator, tmp_path):
     """A step this large makes the next loss infinite."""
     folder = RunFolder(tmp_path).trial("random_0000")
-    entries = list(trial(problem(generator), folder, {"learning_rate": 1e3, "layers": 12, "activation": "leaky_relu"}))
+    entries = list(
+        trial(
+            problem(generator),
+            folder,
+            {"training.learning_rate": 1e3, "network.layers": 12, "network.activation": "leaky_relu"},
+        )
+    )
     assert entries[-1]["diverged"]
     assert entries[-1]["valid_error"] is None
     assert json.loads((folder.path / "log.jsonl").read_text().splitlines()[-1])["diverged"]

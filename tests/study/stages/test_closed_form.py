@@ -7,7 +7,7 @@ import pytest
 
 from cconv import load_model, open_dataset
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.study.declared.configuration import DEFAULTS, OPTIONAL_FEATURES
+from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, OPTIONAL_FEATURES, feature_path
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
@@ -24,8 +24,10 @@ from cconv.tasks.samples import iterate_samples
 
 
 def space_of(**parameters):
+    """A space of choices, named by the ends of their paths."""
+    paths = {path.rpartition(".")[2]: path for path in HYPERPARAMETERS}
     domains = {
-        name: {"type": "choice", "values": values, "baseline": values[0], "reason": "test"}
+        paths[name]: {"type": "choice", "values": values, "baseline": values[0], "reason": "test"}
         for name, values in parameters.items()
     }
     return SearchSpace.model_validate({"name": "test", "description": "test", "parameters": domains})
@@ -37,27 +39,33 @@ def test_every_combination_is_tried_once_and_what_has_no_effect_is_left_out():
         window=["none", "poly6"], layers=[1, 4], learning_rate=[1e-3, 1e-2],
     )  # fmt: skip
     layers = single_layers(space, DEFAULTS.network, 3)
-    grid = [layer for layer in layers if layer["architecture"] == "conv_net"]
-    radial = [layer for layer in layers if layer["architecture"] == "radial_net"]
+    grid = [layer for layer in layers if layer["network.architecture"] == "conv_net"]
+    radial = [layer for layer in layers if layer["network.architecture"] == "radial_net"]
     assert len(grid) == 3 * 2
     assert len(radial) == 2 * 2
-    assert all(set(layer) == {"layers", "architecture", "kernel_size", "window"} for layer in grid)
-    assert all(set(layer) == {"layers", "architecture", "radial_terms", "window"} for layer in radial)
-    assert all(layer["layers"] == 1 for layer in layers)
+    assert all(
+        set(layer) == {"network.layers", "network.architecture", "network.kernel_size", "network.window"}
+        for layer in grid
+    )
+    assert all(
+        set(layer) == {"network.layers", "network.architecture", "network.radial_terms", "network.window"}
+        for layer in radial
+    )
+    assert all(layer["network.layers"] == 1 for layer in layers)
 
 
 def test_ranges_are_sampled_with_both_ends():
     space = load_space("search_spaces/density.toml")
     layers = single_layers(space, DEFAULTS.network, 3)
-    assert {layer["relative_cutoff"] for layer in layers} == {1.5, 2.0, 2.5}
+    assert {layer["network.relative_cutoff"] for layer in layers} == {1.5, 2.0, 2.5}
 
 
 def test_a_draw_holds_as_many_of_each_basis():
-    layers = [{"architecture": "conv_net", "kernel_size": size} for size in range(50)]
-    layers += [{"architecture": "radial_net", "radial_terms": terms} for terms in range(5)]
+    layers = [{"network.architecture": "conv_net", "network.kernel_size": size} for size in range(50)]
+    layers += [{"network.architecture": "radial_net", "network.radial_terms": terms} for terms in range(5)]
     drawn = _draw(layers, 20, seed=0)
     assert len(drawn) == 20
-    assert sum(layer["architecture"] == "radial_net" for layer in drawn) == 5
+    assert sum(layer["network.architecture"] == "radial_net" for layer in drawn) == 5
     assert drawn == _draw(layers, 20, seed=0) != _draw(layers, 20, seed=1)
     assert _draw(layers, 100, seed=0) == layers
 
@@ -72,8 +80,8 @@ LAYERS = single_layers(
     DEFAULTS.network,
     3,
 )
-RADIAL = [layer for layer in LAYERS if layer["architecture"] == "radial_net"]
-GRID = [layer for layer in LAYERS if layer["architecture"] == "conv_net"]
+RADIAL = [layer for layer in LAYERS if layer["network.architecture"] == "radial_net"]
+GRID = [layer for layer in LAYERS if layer["network.architecture"] == "conv_net"]
 
 
 def changes(layer, other):
@@ -90,17 +98,22 @@ def winners_of(*layers):
     return [SimpleNamespace(parameters=layer) for layer in layers]
 
 
+BASIS_SIZES = {"network.kernel_size"}, {"network.radial_terms"}
+
+
 @pytest.mark.parametrize("winners", [RADIAL[:1], RADIAL[:2], [GRID[0], RADIAL[0]], [RADIAL[0], RADIAL[-1]]])
-def test_every_other_number_of_terms_of_every_winner_comes_first_and_once(winners):
+def test_every_other_number_of_basis_functions_of_every_winner_comes_first_and_once(winners):
     untried = without(LAYERS, winners)
     proposed = propose(winners_of(*winners), untried)
-    near = [layer for layer in RADIAL if any(changes(layer, winner) == {"radial_terms"} for winner in winners)]
+    near = [layer for layer in LAYERS if any(changes(layer, winner) in BASIS_SIZES for winner in winners)]
     assert sorted(map(identity, proposed)) == sorted(identity(layer) for layer in near if layer in untried)
 
 
 def test_then_come_the_layers_one_change_away_from_the_most_accurate_winner_that_has_any_left():
-    first, second = GRID[0], GRID[-1]
-    untried = without(LAYERS, [first, second])
+    first, second = GRID[0], RADIAL[0]
+    winners = [first, second]
+    of_other_size = [each for each in LAYERS if any(changes(each, winner) in BASIS_SIZES for winner in winners)]
+    untried = without(LAYERS, [*winners, *of_other_size])
     proposed = propose(winners_of(first, second), untried)
     assert proposed
     assert all(len(changes(layer, first)) == 1 for layer in proposed)
@@ -152,17 +165,21 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
 def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept, tmp_path, monkeypatch):
     def fit(session, parameters, folder, stage, seed, ridge):
         folder.start({"stage": stage, "parameters": parameters})
-        error = errors[" ".join(branch for branch in OPTIONAL_FEATURES if parameters[branch])]
+        error = errors[" ".join(branch for branch in OPTIONAL_FEATURES if parameters[feature_path(branch)])]
         folder.append({"updates": 0, "valid_error": error, "seconds": 1.0})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     space = space_of(walls=[True, False], density=[True, False])
     study = SimpleNamespace(selection=SimpleNamespace(margin=0.05))
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space, study=study)
-    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True, "density": True})
+    candidate = SimpleNamespace(
+        id="found", parameters={"network.layers": 1, "task.features.walls": True, "task.features.density": True}
+    )
     finalist, parameters = without_unneeded_features(session, candidate, seed=1, ridge=0.0)
-    assert " ".join(branch for branch in OPTIONAL_FEATURES if parameters[branch]) == kept
-    assert finalist == "found" + "".join(f"_no_{branch}" for branch in OPTIONAL_FEATURES if not parameters[branch])
+    assert " ".join(branch for branch in OPTIONAL_FEATURES if parameters[feature_path(branch)]) == kept
+    assert finalist == "found" + "".join(
+        f"_no_{branch}" for branch in OPTIONAL_FEATURES if not parameters[feature_path(branch)]
+    )
     assert session.run.finalist(finalist, 1).parameters == parameters
 
 
@@ -175,7 +192,7 @@ def test_a_finalist_keeps_a_branch_that_the_space_does_not_vary(tmp_path, monkey
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     session = SimpleNamespace(run=RunFolder(tmp_path), space=space_of(walls=[True]))
-    candidate = SimpleNamespace(id="found", parameters={"layers": 1, "walls": True})
+    candidate = SimpleNamespace(id="found", parameters={"network.layers": 1, "task.features.walls": True})
     assert without_unneeded_features(session, candidate, seed=1, ridge=0.0) == ("found", candidate.parameters)
     assert fitted == [candidate.parameters]
 

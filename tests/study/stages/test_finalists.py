@@ -22,7 +22,7 @@ def retrain(run, finalist, seed, outcome="completed", reason="", errors=(0.5, 0.
 
 def test_every_finalist_gets_every_seed_after_the_searchs(run):
     jobs = finalist_jobs(
-        [Finalist(id="baseline", parameters={}), Finalist(id="a", parameters={"layers": 1})], 2, 5, run
+        [Finalist(id="baseline", parameters={}), Finalist(id="a", parameters={"network.layers": 1})], 2, 5, run
     )
     assert [(job.name, job.init_seed) for job in jobs] == [
         ("baseline/seed_5", 5), ("baseline/seed_6", 6), ("a/seed_5", 5), ("a/seed_6", 6),

@@ -16,9 +16,9 @@ def session(tmp_path):
 
 
 def test_a_trial_that_was_begun_goes_on_only_with_its_own_parameters(session):
-    parameters = {"layers": 2, "learning_rate": 0.1 + 0.2, "message": "difference"}
+    parameters = {"network.layers": 2, "training.learning_rate": 0.1 + 0.2, "network.message": "difference"}
     job = trial_job(session, "random", 3, parameters)
     session.run.trial(job.name).start({"stage": "random", "parameters": parameters, "init_seed": job.init_seed})
     assert trial_job(session, "random", 3, parameters) == job
     with pytest.raises(ConfigError, match=r"random_0003: was begun with other hyperparameters"):
-        trial_job(session, "random", 3, parameters | {"layers": 3})
+        trial_job(session, "random", 3, parameters | {"network.layers": 3})

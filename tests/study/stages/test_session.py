@@ -35,7 +35,7 @@ def test_streams_of_stages_and_studies_never_overlap():
 REFINED = """name = "refined"
 description = "d"
 
-[parameters.radial_terms]
+[parameters.network.radial_terms]
 type = "choice"
 values = [4, 8]
 baseline = 4
@@ -49,4 +49,4 @@ def test_a_refined_space_is_read_with_the_settings_of_its_study(tmp_path):
     (tmp_path / "stages" / "refine.toml").write_text(REFINED)
     of_network = ["network={architecture = 'radial_net', layers = 2}", "stages.adaptive.space=refine"]
     session = replace(session_of(*of_network), run=RunFolder(tmp_path))
-    assert list(session.space_of("adaptive").parameters) == ["radial_terms"]
+    assert list(session.space_of("adaptive").parameters) == ["network.radial_terms"]
