@@ -17,6 +17,7 @@ INTERRUPTED = 130
 
 app = typer.Typer(
     name="cconv",
+    rich_markup_mode="markdown",  # which fills paragraphs
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
