@@ -63,7 +63,8 @@ def run(
     study: StudyFile,
     data: DataPath = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Run folder to write; runs/NAME if not given, by the name in the study file.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Run folder to write; runs/NAME if not given, by the study's name."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
     address: Address = None,
