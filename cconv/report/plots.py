@@ -148,16 +148,16 @@ def cost_chart(summary: Mapping) -> Figure:
 
 
 def stability_chart(summary: Mapping) -> Figure:
-    """Each check of stability by its limit, log axis: left of the line at 1 a finalist passes."""
-    checks = [check for check in verdict_matrix(summary) if check.limit is not None]
+    """Each finding of the checks of stability by its limit, log axis: left of the line at 1 a finalist passes."""
+    findings = [row for row in verdict_matrix(summary) if row.limit is not None]
     names = [entry["id"] for entry in summary["finalists"]]
-    figure, axes = new_figure(9, 1.6 + 0.3 * len(checks))
+    figure, axes = new_figure(9, 1.6 + 0.3 * len(findings))
     for number, name in enumerate(names):
-        places = [place for place, check in enumerate(checks) if check.cells[number].value is not None]
-        ratios = [checks[place].cells[number].value / checks[place].limit for place in places]
+        places = [place for place, row in enumerate(findings) if row.cells[number].value is not None]
+        ratios = [findings[place].cells[number].value / findings[place].limit for place in places]
         axes.plot(ratios, places, "o", alpha=0.8, label=name)
     axes.axvline(1, color=MARKED["baseline"], lw=1.2)
-    axes.set_yticks(range(len(checks)), [check.label for check in checks])
+    axes.set_yticks(range(len(findings)), [f"{row.check}: {row.label}" for row in findings])
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="measured by limit", title="checks of stability")
     _legend(axes)

@@ -45,11 +45,13 @@ def hostile(summary):
     summary["refined"] = {HOSTILE: HOSTILE}
     summary["failed_finalists"] = {HOSTILE: HOSTILE}
     summary["selection"]["rule"] = HOSTILE
+    summary["checks"] = dict.fromkeys(summary["checks"], HOSTILE)
     for row in summary["selection"]["comparisons"]:
         row["why_not"] = HOSTILE
     for entry in summary["finalists"]:
         entry["config"]["parameters"] |= {"window": HOSTILE, HOSTILE: HOSTILE}
         entry["stability"]["failures"] = [HOSTILE]
+        entry["stability"]["findings"][0] |= {"label": HOSTILE, "detail": HOSTILE}
     for point in summary["search_points"]:
         point["parameters"] = {"window": HOSTILE, HOSTILE: 1}
     return summary

@@ -133,6 +133,25 @@ class _Model(OpenModel):
     reason: str
 
 
+class _Finding(OpenModel):
+    """What a check of stability found in a finalist in summary.json."""
+
+    check: Name
+    label: str
+    value: Real
+    limit: Real
+    detail: str
+
+
+class _Stability(OpenModel):
+    """Stability of a finalist in summary.json."""
+
+    stable: Flag
+    findings: list[_Finding]
+    failures: list[str]
+    counts: dict[str, _Count]
+
+
 class _Finalist(OpenModel):
     """A finalist in summary.json."""
 
@@ -141,7 +160,7 @@ class _Finalist(OpenModel):
     config: dict
     test: dict
     cost: dict
-    stability: dict | None
+    stability: _Stability | None
 
 
 class _Importance(OpenModel):
@@ -158,6 +177,7 @@ class _Summary(OpenModel):
 
     study: Name
     baseline: Name
+    checks: dict[Name, str]
     recommended: _Model
     finalists: Annotated[list[_Finalist], Field(min_length=1)]
     pareto_front: list[Id]

@@ -11,10 +11,12 @@ from typing import Literal
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
+from cconv.evaluation.checks import make_checks
+from cconv.evaluation.checks.material import make_material
+from cconv.evaluation.checks.predictor import ModelPredictor
+from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
-from cconv.evaluation.probes import make_probes
-from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.models.checkpoint import load_model
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.budget import budget_words
@@ -82,6 +84,7 @@ def _summary(session: Session, stage: str) -> dict:
         "task": study.task.name,
         "dataset": _dataset(session, samples),
         "baseline": BASELINE,
+        "checks": judged.checks,
         "mean_predictor": trivial,
         "finalists": entries,
         "budget": budget_words(entries, found.get("convergence", {}), study.selection.margin),
@@ -109,7 +112,8 @@ class _Judged:
         costs: Cost of each, and of some trials.
         analytic: Cost of the analytic field, timed in turn with them.
         times: Time of each.
-        stability: Checks of each.
+        checks: What each check of stability looks at, by name.
+        stability: What the checks found in each.
         choose: Validation errors of the finalists to a recommendation.
         chosen: The recommendation by all seeds.
     """
@@ -119,6 +123,7 @@ class _Judged:
     costs: dict[str, Cost]
     analytic: AnalyticCost
     times: dict[str, Timing]
+    checks: dict[str, str]
     stability: dict[str, dict]
     choose: Callable[[Mapping[str, np.ndarray]], Recommendation]
     chosen: Recommendation
@@ -127,12 +132,12 @@ class _Judged:
 def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
     settings = session.study.selection
     facts, errors = _errors(session, finalists, session.problem.valid_samples, "validation errors")
-    (costs, analytic), stability = _time(session, finalists), _stress(session, finalists)
+    (costs, analytic), (checks, stability) = _time(session, finalists), _stress(session, finalists)
     times = {name: Timing(costs[name].turns_ms) for name in facts}
     choose = partial(
         recommend,
         times=times,
-        failures={name: checks["failures"] for name, checks in stability.items()},
+        failures={name: found["failures"] for name, found in stability.items()},
         accurate_enough=settings.accurate_enough,
         margin=settings.margin,
     )
@@ -142,6 +147,7 @@ def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
         costs=costs,
         analytic=analytic,
         times=times,
+        checks=checks,
         stability=stability,
         choose=choose,
         chosen=choose(errors),
@@ -220,22 +226,28 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
     }
 
 
-def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, dict]:
-    """Stability of every seed on validation trajectories; the test split is only looked at for its errors."""
+def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, str], dict[str, dict]]:
+    """What each check of stability looks at, and what they found in every seed, all on validation trajectories.
+
+    The test split is only looked at for its errors.
+    """
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    probes = make_probes(trajectories, scene, problem.task, reach)
-    return {
+    material = make_material(trajectories, scene, problem.task, reach)
+    checks = make_checks(material)
+    found = {
         finalist.id: measure_stability(
             {
                 record.id: ModelPredictor(load_model(checkpoint))
                 for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True)
             },
-            probes,
+            checks,
+            material,
         )
         for finalist in session.progress(finalists, "stability")
     }
+    return {check.name: check.description() for check in checks}, found
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
