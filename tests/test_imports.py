@@ -20,6 +20,7 @@ TIERS = [
     {"data"},
     {"tasks"},
     {"models"},
+    {"rollout"},
     {"evaluation", "training"},
     {"study"},
     {"report"},

@@ -1,0 +1,100 @@
+"""Windows: consecutive frames that a step is predicted from, and those that follow."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from cconv.data.trajectory import Boundary, ParticleType, Trajectory
+from cconv.errors import DataError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Consecutive frames of a trajectory, the last of which is the present.
+
+    Attributes:
+        positions: The past and the present, (H, N, D), length.
+        future: The frames that follow, as far as they are known, (F, N, D).
+        masses: (N,).
+        particle_types: (N,), int64, values of `ParticleType`.
+        boundary: Wall points, or None.
+        trajectory: Name of the trajectory.
+        frame: Index of the present in the stored trajectory.
+    """
+
+    positions: Tensor
+    future: Tensor
+    masses: Tensor
+    particle_types: Tensor
+    boundary: Boundary | None
+    trajectory: str
+    frame: int
+
+    @property
+    def present(self) -> Tensor:
+        """Positions now, (N, D)."""
+        return self.positions[-1]
+
+    @property
+    def is_fluid(self) -> Tensor:
+        """Which particles a model moves, (N,), bool; the others move as prescribed."""
+        return self.particle_types == ParticleType.FLUID
+
+    def followed_by(self, positions: Tensor) -> "Window":
+        """The window a frame later, whose present is `positions` (N, D); as long as this one."""
+        past = torch.cat([self.positions[1:], positions[None]])
+        return replace(self, positions=past, future=self.future[1:], frame=self.frame + 1)
+
+
+def window_at(trajectory: Trajectory, present: int, history: int, future: int) -> Window:
+    """The window of a trajectory whose present is one of its frames.
+
+    Args:
+        trajectory: The trajectory.
+        present: Index of the present, counted from the trajectory's first frame here.
+        history: Frames up to the present, H.
+        future: Frames after it, F.
+
+    Raises:
+        DataError: If the trajectory does not have all these frames.
+    """
+    first, stop = present - history + 1, present + 1 + future
+    if not 0 <= first < stop <= len(trajectory):
+        raise DataError(
+            f"trajectory {trajectory.name}: has {len(trajectory)} frames, and a window of {history} up to frame "
+            f"{present} and {future} after it needs frames {first} to {stop - 1}; ask for fewer or another start."
+        )
+    return Window(
+        positions=trajectory.positions[first : present + 1],
+        future=trajectory.positions[present + 1 : stop],
+        masses=trajectory.masses,
+        particle_types=trajectory.particle_types,
+        boundary=trajectory.boundary,
+        trajectory=trajectory.name,
+        frame=trajectory.first_frame + present,
+    )
+
+
+def windows(trajectory: Trajectory, history: int, future: int, stride: int = 1) -> Iterator[Window]:
+    """All windows of a trajectory, or every one at a stride.
+
+    LagrangeBench's test windows do not overlap: their stride is ``history + future``.
+
+    Args:
+        trajectory: The trajectory.
+        history: Frames up to the present, H.
+        future: Frames after it, F.
+        stride: Frames from one present to the next.
+
+    Raises:
+        DataError: If the trajectory is too short for a single one.
+    """
+    if len(trajectory) < history + future:
+        raise DataError(
+            f"trajectory {trajectory.name}: has {len(trajectory)} frames, too few for a window of {history} and "
+            f"{future} after it; lower the history, or store more frames."
+        )
+    presents = range(history - 1, len(trajectory) - future, stride)
+    return (window_at(trajectory, present, history, future) for present in presents)

@@ -1,0 +1,1 @@
+"""Rollouts: a model's answers turned into the next frame, again and again."""
