@@ -2,7 +2,7 @@
 # make test-fast   environment, the tests that start no processes: laws and formats, a minute or two
 # make test    environment, whole test suite, on all cores
 # make test-slow   what takes hours: clusters, kills, cold compilation, a thousand inputs
-# make check   environment, lint and format
+# make check   environment, lint, format and types
 # make data    environment and the data of the quick study, made by the SPH solver
 
 PYTHON ?= python3.11
@@ -29,6 +29,7 @@ test-slow: $(VENV)/.installed
 check: $(VENV)/.installed
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
 
 data: $(DATA)/metadata.json
 

@@ -1,6 +1,7 @@
 """Find the smallest, fastest continuous-convolution network that is accurate and stable enough for a fluid scene."""
 
 from importlib import import_module
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -16,7 +17,7 @@ _HOMES = {
 __all__ = list(_HOMES)
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     # Loaded when first used: torch takes seconds, and `cconv --help` needs none of it.
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)

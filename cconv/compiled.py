@@ -1,12 +1,13 @@
 """Compiled functions whose cache on disk may be missing, damaged or not writable: then they are compiled again."""
 
 from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 from numba.core.caching import NullCache
 
 
-def compile_cached(**options) -> Callable:
+def compile_cached(**options: Any) -> Callable:
     """Compile functions with numba and `options`, and keep the machine code on disk where that is possible.
 
     numba fails where a file of its cache holds garbage or cannot be written, and where there is no place for a cache.
@@ -33,13 +34,13 @@ class _ForgivingCache:
         cache: The cache.
     """
 
-    def __init__(self, cache):
+    def __init__(self, cache: Any):
         self._cache = cache
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._cache, name)
 
-    def load_overload(self, signature, target):
+    def load_overload(self, signature: Any, target: Any) -> Any:
         """The machine code for a signature; None if there is none, or none that can be read."""
         try:
             return self._cache.load_overload(signature, target)
@@ -47,7 +48,7 @@ class _ForgivingCache:
             self._begin_anew()
             return None
 
-    def save_overload(self, signature, result) -> None:
+    def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the machine code for a signature, if that is possible."""
         try:
             self._cache.save_overload(signature, result)

@@ -1,6 +1,7 @@
 """The box that particles live in: bounds, periodic axes, minimum-image displacement and wrap."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +30,7 @@ class Box:
     upper: tuple[float, ...]
     periodic: tuple[bool, ...]
 
-    def __init__(self, lower, upper, periodic=False):
+    def __init__(self, lower: Sequence[float], upper: Sequence[float], periodic: bool | Sequence[bool] = False):
         lower = tuple(float(value) for value in lower)
         upper = tuple(float(value) for value in upper)
         periodic = (periodic,) * len(lower) if isinstance(periodic, bool) else tuple(bool(axis) for axis in periodic)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any, NoReturn
 
 from filelock import FileLock
 
@@ -50,7 +51,7 @@ def read_text(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvEr
         raise error(f"{path}: cannot be read ({problem.strerror}).") from problem
 
 
-def read_json(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvError] = DataError):
+def read_json(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvError] = DataError) -> Any:
     """Content of a JSON file; arguments and errors as of `read_text`."""
     text = read_text(path, largest, error)
     try:
@@ -59,7 +60,7 @@ def read_json(path: Path | str, largest: int = LARGEST_FILE, error: type[CConvEr
         raise error(f"{path}: not JSON ({problem}); restore the file or make it again.") from problem
 
 
-def parse_json(text: str):
+def parse_json(text: str) -> Any:
     """Value of a JSON text without NaN, infinity and repeated keys, at most `DEEPEST` deep.
 
     Raises:
@@ -92,7 +93,7 @@ def parse_toml(text: str) -> dict:
     return _parsed(text, tomllib.loads)
 
 
-def _parsed(text: str, parse: Callable[[str], object]):
+def _parsed(text: str, parse: Callable[[str], Any]) -> Any:
     """What `parse` makes of a text, unless it is too deep."""
     try:
         value = parse(text)
@@ -105,7 +106,7 @@ def _parsed(text: str, parse: Callable[[str], object]):
     return value
 
 
-def _refuse_constant(name: str):
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number of JSON")
 
 
@@ -126,7 +127,7 @@ def _depth(value: object) -> int:
     return depth
 
 
-def write_json(path: Path, value) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write JSON under a temporary name, then rename, so that a reader never finds half a file."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,7 +72,7 @@ class Edges:
                 "splits or indices beyond that; build them with `radius_graph`."
             )
 
-    def to(self, *args, **kwargs) -> "Edges":
+    def to(self, *args: Any, **kwargs: Any) -> "Edges":
         """Edges with distances and displacements converted, and all tensors moved, as `torch.Tensor.to` does."""
         displacements = self.displacements.to(*args, **kwargs)
         device = displacements.device
@@ -114,11 +115,8 @@ def radius_graph(
     _check_cutoff(cutoff, box)
     if include_self and queries is not None:
         raise ConfigError("`include_self` must be False with `queries`: they are other points than `positions`.")
-    grid, receivers, *others = _sorted_in_cells(
-        [receivers_at] if queries is None else [queries, positions], cutoff, box
-    )
-    senders = others[0] if others else receivers
-    pairs = pairs_by_receiver(receivers, senders, grid, include_self)
+    grid, cells = _sorted_in_cells([positions] if queries is None else [queries, positions], cutoff, box)
+    pairs = pairs_by_receiver(cells[0], cells[-1], grid, include_self)
     row_splits, receivers, senders = (torch.from_numpy(array).to(positions.device) for array in pairs)
     displacements, distances = _separations(receivers_at, positions, row_splits, receivers, senders, box)
     return Edges(
@@ -141,7 +139,7 @@ def half_list(positions: Tensor, cutoff: float, box: Box | None = None) -> np.nd
     """
     _check_points(positions, positions, box)
     _check_cutoff(cutoff, box)
-    grid, cells = _sorted_in_cells([positions], cutoff, box)
+    grid, (cells,) = _sorted_in_cells([positions], cutoff, box)
     return half_pairs(cells, grid)
 
 
@@ -184,11 +182,11 @@ def _check_cutoff(cutoff: float, box: Box | None) -> None:
             )
 
 
-def _sorted_in_cells(sets: Sequence[Tensor], cutoff: float, box: Box | None) -> tuple[CellGrid, *tuple[Cells, ...]]:
+def _sorted_in_cells(sets: Sequence[Tensor], cutoff: float, box: Box | None) -> tuple[CellGrid, list[Cells]]:
     """Cells of the cutoff around the first of `sets` of points, and each of them sorted by these cells."""
     arrays = [_from_corner(points.detach().cpu().double(), box).numpy() for points in sets]
     grid = CellGrid.around(arrays[0], cutoff, _periodic_lengths(sets[0].shape[1], box))
-    return grid, *(grid.sort(points) for points in arrays)
+    return grid, [grid.sort(points) for points in arrays]
 
 
 def _from_corner(points: Tensor, box: Box | None) -> Tensor:

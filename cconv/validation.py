@@ -5,7 +5,7 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -99,7 +99,7 @@ def validated(model: type[Model], values: object, source: Path | str, error: typ
         raise error(f"{source}: {_describe(model, values, problem)}") from problems
 
 
-def check_setting(annotation: object, value: object, name: str) -> None:
+def check_setting(annotation: Any, value: object, name: str) -> None:
     """Raise `ConfigError` unless a value, e.g. an option of the command line, fits one of the types above."""
     try:
         TypeAdapter(annotation).validate_python(value)
@@ -128,7 +128,7 @@ def _sentence(problem: Mapping) -> str:
     return f"{message[0].lower()}{message[1:]}{came}."
 
 
-def _written_path(values: object, location: Sequence[str | int], is_missing: bool) -> list[str | int]:
+def _written_path(values: Any, location: Sequence[str | int], is_missing: bool) -> list[str | int]:
     """The location without the names of union members, which stand in no file."""
     path = []
     for place, part in enumerate(location, start=1):
@@ -177,7 +177,7 @@ def _is_tagged(model: type[BaseModel], tag: str) -> bool:
     return any(isinstance(field.default, str) and field.default == tag for field in model.model_fields.values())
 
 
-def _models_in(annotation) -> list[type[BaseModel]]:
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for argument in typing.get_args(annotation) for model in _models_in(argument)]

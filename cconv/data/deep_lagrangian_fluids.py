@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import msgpack
 import numpy as np
@@ -34,6 +34,7 @@ LARGEST_WINDOW = 2**31  # bytes that zstd looks back at most
 PIECE = 2**24  # bytes decompressed at a time
 MOST_OBJECTS = 2_000_000  # keys, values and items in a file; a frame has about sixty
 COPIES = 3  # of the content at the same time: bytes, decoded frames, stacked frames
+Container = TypeVar("Container", dict, list)  # of msgpack
 
 
 class DeepLagrangianFluidsSource:
@@ -245,7 +246,7 @@ def _unpack(content: bytearray) -> object:
     """What msgpack holds, arrays decoded; refused where it is so many objects that they would not fit into memory."""
     count = 0
 
-    def counted(values: dict | list) -> dict | list:
+    def counted(values: Container) -> Container:
         nonlocal count
         count += 1 + len(values)
         if count > MOST_OBJECTS:
@@ -285,7 +286,7 @@ def _damaged(file: Path, error: Exception) -> DataError:
     return DataError(f"{file}: {what}; copy it again.")
 
 
-def _member(file: Path, frame: Mapping, name: str, key: str) -> object:
+def _member(file: Path, frame: Mapping, name: str, key: str) -> Any:
     if key not in frame:
         known = one_line(", ".join(str(known) for known in frame))
         raise DataError(f"{file}: trajectory {name}: key `{key}` is missing; frames must hold it (found: {known}).")
@@ -294,7 +295,7 @@ def _member(file: Path, frame: Mapping, name: str, key: str) -> object:
 
 def _stack(files: list[Path], frames: list[dict], name: str, key: str, start: int) -> Tensor:
     """The arrays under `key` of all frames, (T, N, D)."""
-    arrays = []
+    arrays: list[np.ndarray] = []
     for index, (file, frame) in enumerate(zip(files, frames, strict=True)):
         array = _member(file, frame, name, key)
         check_array(array, ("particles", "dim"), file, f"trajectory {name}, frame {start + index}", key)
@@ -333,8 +334,8 @@ def _boundary(file: Path, frame: Mapping) -> Boundary | None:
 
 
 def _check_same_boundary(files: list[Path], boundaries: list[Boundary | None], name: str) -> None:
-    first, held = boundaries[0], [boundary.positions for boundary in boundaries if boundary]
-    if first is None and held or any(not torch.equal(positions, first.positions) for positions in held):
+    held = [boundary.positions for boundary in boundaries if boundary]
+    if held and (boundaries[0] is None or any(not torch.equal(positions, held[0]) for positions in held)):
         raise DataError(
             f"{files[0]}: trajectory {name}: `box` differs between its files; walls must not move or change: "
             "make each file a trajectory of its own."

@@ -175,7 +175,7 @@ def _load(file: Path) -> Simulation:
 def _request(scene: SimulatedScene, num_frames: int, seed: int) -> dict:
     """What trajectories depend on, but for their number: settings, seed and the code that computes them."""
     settings = {"scene": scene.name, **asdict(scene), "num_trajectories": None, "num_frames": num_frames, "seed": seed}
-    modules = sorted(file for folder in (sph, scenes) for file in Path(folder.__file__).parent.glob("*.py"))
+    modules = sorted(file for folder in (sph, scenes) for file in Path(folder.__path__[0]).glob("*.py"))
     code = hashlib.sha256(b"".join(file.read_bytes() for file in modules)).hexdigest()
     return json.loads(json.dumps({**settings, "code": code}))
 
@@ -234,7 +234,8 @@ def _splits(scene: SimulatedScene, files: list[Path], num_frames: int) -> dict[s
             split: (_trajectory(scene, files[0], block.start, block.stop) for block in members)
             for split, members in zip(SPLITS, blocks, strict=True)
         }
-    splits, start = {}, 0
+    splits: dict[str, Iterable[Trajectory]] = {}
+    start = 0
     for split, count in zip(SPLITS, share_out(len(files), SPLIT_FRACTIONS), strict=True):
         members = files[start : start + count]
         splits[split] = (_trajectory(scene, file, 0, num_frames) for file in members)
@@ -242,7 +243,7 @@ def _splits(scene: SimulatedScene, files: list[Path], num_frames: int) -> dict[s
     return splits
 
 
-def _trajectory(scene: SimulatedScene, file: Path, start: int, stop: int) -> Trajectory:
+def _trajectory(scene: SimulatedScene, file: Path, start: int, stop: int | None) -> Trajectory:
     simulation = _load(file)
     particles = len(simulation.particle_types)
     boundary = scene.boundary

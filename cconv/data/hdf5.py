@@ -207,7 +207,7 @@ def _statistics(summaries: Mapping[str, _Summary]) -> dict:
     standardise by training data only.
     """
     train, test = summaries["train"], summaries["test"]
-    statistics = {
+    statistics: dict[str, int | list[float]] = {
         "sequence_length_train": min(train.lengths) - 1,
         "num_trajs_train": len(train.lengths),
         "sequence_length_test": min(test.lengths) - 1,

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import first_of_each, trajectory_findings
-from cconv.data.trajectory import Frame, ParticleType, Trajectory
+from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.neighbors import radius_graph
@@ -36,7 +36,7 @@ def inspect_dataset(
     """
     scene = dataset.scene
     cutoff = 2 * scene.particle_spacing if cutoff is None else cutoff
-    collected = defaultdict(list)
+    collected: dict[ParticleType | str, list] = defaultdict(list)
     splits, findings = {}, []
     for split, blocks in dataset.splits.items():
         splits[split] = {"trajectories": len(blocks), "frames": 0}
@@ -51,6 +51,15 @@ def inspect_dataset(
         "name": scene.name,
         "sha256": dataset.fingerprint(),
         "splits": splits,
+        **_scene_facts(scene),
+        **_particle_facts(collected, cutoff),
+        "missing": list(scene.missing),
+        "findings": [finding.as_dict() for finding in first_of_each(findings)],
+    }
+
+
+def _scene_facts(scene: Scene) -> dict:
+    return {
         "dim": scene.dim,
         "particle_spacing": scene.particle_spacing,
         "frame_dt": scene.frame_dt,
@@ -62,6 +71,11 @@ def inspect_dataset(
         "force": None if scene.force is None else list(scene.force),
         "velocity_source": scene.velocity_source,
         "mass_source": scene.mass_source,
+    }
+
+
+def _particle_facts(collected: dict[ParticleType | str, list], cutoff: float) -> dict:
+    return {
         "particles": {kind.name.lower(): _range(collected[kind]) for kind in ParticleType if max(collected[kind])},
         "boundary": {"points": _range(collected["boundary_points"]), "normals": all(collected["normals"])},
         "mass": {"min": min(collected["mass_min"]), "max": max(collected["mass_max"])},
@@ -72,12 +86,10 @@ def inspect_dataset(
             "min": min(collected["neighbors_min"]),
             "max": max(collected["neighbors_max"]),
         },
-        "missing": list(scene.missing),
-        "findings": [finding.as_dict() for finding in first_of_each(findings)],
     }
 
 
-def _collect(collected: dict, trajectory: Trajectory, box: Box, cutoff: float) -> None:
+def _collect(collected: dict[ParticleType | str, list], trajectory: Trajectory, box: Box, cutoff: float) -> None:
     """Append what one trajectory has; neighbours are counted in its first and last frame."""
     for kind in ParticleType:
         collected[kind].append(int((trajectory.particle_types == kind).sum()))

@@ -43,7 +43,7 @@ def one_line(value: object, longest: int = LONGEST_TEXT) -> str:
     return shown + (f"... ({len(text)} characters)" if len(text) > longest else "")
 
 
-def _readable(size: int) -> str:
+def _readable(size: float) -> str:
     for unit in ("bytes", "KB", "MB", "GB"):
         if size < 1000:
             return f"{size:.3g} {unit}"

@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, TypeGuard
 
 from cconv.data.limits import one_line
 from cconv.data.source import LARGEST, SMALLEST, STORED, Given
@@ -169,12 +170,12 @@ def _box(metadata: Mapping, dim: int, file: Path) -> Box:
         f"at least {dim} truth values (true or false)",
     )
     try:
-        return Box(*zip(*bounds, strict=True), tuple(map(bool, periodic[:dim])))
+        return Box([low for low, _ in bounds], [high for _, high in bounds], periodic[:dim])
     except ShapeError as error:
         raise DataError(f"{file}: `bounds`: {error}") from error
 
 
-def _value(metadata: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str):
+def _value(metadata: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str) -> Any:
     if key not in metadata:
         raise DataError(f"{file}: key `{key}` is missing; add it ({wanted}).")
     if not fits(metadata[key]):
@@ -182,7 +183,7 @@ def _value(metadata: Mapping, key: str, file: Path, fits: Callable[[object], boo
     return metadata[key]
 
 
-def _own(own: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str):
+def _own(own: Mapping, key: str, file: Path, fits: Callable[[object], bool], wanted: str) -> Any:
     if own.get(key) is None:
         return None
     if not fits(own[key]):
@@ -202,7 +203,7 @@ def _positive(metadata: Mapping, key: str, file: Path) -> float:
     return float(_value(metadata, key, file, lambda value: _is_number(value) and value >= SMALLEST, wanted))
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 

@@ -43,12 +43,14 @@ def side_by_side(generator: Callable[..., Iterable], calls: Sequence[tuple], wor
         for call in islice(waiting, workers):
             processes.append(_started(context, generator, call, threads, busy))
         while busy:
-            for connection in wait(busy):
+            ready = wait(busy)
+            for connection in [each for each in busy if each in ready]:
                 if not _received(connection):
                     yield
                     continue
-                connection.send(call := next(waiting, None))
-                if call is None:
+                following: tuple | None = next(waiting, None)
+                connection.send(following)
+                if following is None:
                     busy.remove(connection)
     except (EOFError, ConnectionError) as error:
         raise DataError(
@@ -100,5 +102,7 @@ def _work(connection: Connection, generator: Callable, threads: int) -> None:
 
 def _end_with_parent() -> None:
     """End this process, whatever it computes, when its parent is gone."""
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this runs in workers alone
+    parent.join()
     os._exit(1)

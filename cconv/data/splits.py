@@ -36,7 +36,8 @@ def split_by_trajectory(names: Sequence[str], fractions: Sequence[float], seed: 
 
 def split_in_time(name: str, num_frames: int, fractions: Sequence[float], gap: int) -> list[tuple[Block, ...]]:
     """Consecutive blocks of a trajectory by shares, with `gap` frames dropped between blocks."""
-    blocks, start = [], 0
+    blocks: list[tuple[Block, ...]] = []
+    start = 0
     for count in share_out(num_frames - gap * (len(fractions) - 1), fractions):
         blocks.append((Block(name, start, start + count),))
         start += count + gap

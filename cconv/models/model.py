@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from pydantic import Field, model_validator
@@ -13,7 +14,7 @@ from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
 from cconv.neighbors import radius_graph
 from cconv.networks import NetworkTable
-from cconv.networks.network import Geometry, NetworkSettings
+from cconv.networks.network import Geometry, Network, NetworkSettings, WallInputs
 from cconv.nn.kinds import Kinds
 from cconv.ops.workers import results_of
 from cconv.sph.kernels import KERNELS, AbstractKernel
@@ -107,6 +108,11 @@ class Model(nn.Module):
         generator: Source of the initial weights; None for torch's global one.
     """
 
+    feature_mean: Tensor
+    feature_scale: Tensor
+    target_mean: Tensor
+    target_scale: Tensor
+
     def __init__(
         self,
         config: ModelConfig,
@@ -118,7 +124,9 @@ class Model(nn.Module):
         self.config = config
         self.task: FieldTask = task_named(config.task, config.kernel, config.relative_smoothing_length)
         self.settings: NetworkSettings = config.network
-        self.network = config.network.build(config.inputs, config.walls, config.output, config.dim, generator)
+        self.network: Network[Any] = config.network.build(
+            config.inputs, config.walls, config.output, config.dim, generator
+        )
         for name, values in (("feature", features), ("target", targets)):
             self.register_buffer(f"{name}_mean", values.mean.float())
             self.register_buffer(f"{name}_scale", values.scale.float())
@@ -151,7 +159,7 @@ class Model(nn.Module):
         self._check(inputs)
         cutoff = self.settings.relative_cutoff
         searches = [partial(radius_graph, inputs.positions, cutoff, inputs.box)]
-        if self.config.walls:
+        if self.config.walls and inputs.wall_positions is not None:
             searches.append(partial(radius_graph, inputs.wall_positions, cutoff, inputs.box, queries=inputs.positions))
         fluid, *walls = map(self.settings.geometry, results_of(searches))
         return FrameGeometry(fluid, walls[0] if walls else None)
@@ -160,13 +168,16 @@ class Model(nn.Module):
         """Standardised prediction (N, C)."""
         return self.network(*self.network_inputs(inputs, geometry))
 
-    def network_inputs(self, inputs: Inputs, geometry: FrameGeometry) -> tuple:
-        """What the network takes: standardised features and geometry of the fluid, then of the walls."""
+    def network_inputs(
+        self, inputs: Inputs, geometry: FrameGeometry
+    ) -> tuple[Tensor, Geometry, WallInputs[Geometry] | None]:
+        """What the network takes: standardised features of the fluid, its geometry, and the same of the walls."""
         flat = inputs.features.select(self.config.fluid_features).flat()
         features = (flat - self.feature_mean) / self.feature_scale
         arranged = self.settings.arrange(features, self.config.inputs, self.config.dim)
-        walls = () if geometry.walls is None else (inputs.wall_features.flat(), geometry.walls)
-        return arranged, geometry.fluid, *walls
+        if geometry.walls is None or inputs.wall_features is None:
+            return arranged, geometry.fluid, None
+        return arranged, geometry.fluid, WallInputs(inputs.wall_features.flat(), geometry.walls)
 
     def standardize_target(self, target: Tensor) -> Tensor:
         """Target (N, C) in a sample's units to standardised values."""

@@ -1,14 +1,25 @@
 """Networks of continuous convolutions: who answers what a task asks."""
 
-from typing import Annotated, Union
+from typing import Annotated, get_args
 
 from pydantic import Field
 
 from cconv.networks.conv_net import ConvNet, ConvNetSettings
+from cconv.networks.network import Channels, NetworkSettings, WallInputs
 from cconv.networks.radial_net import RadialNet, RadialNetSettings
 
-__all__ = ["ARCHITECTURES", "ConvNet", "ConvNetSettings", "NetworkTable", "RadialNet", "RadialNetSettings"]
+__all__ = [
+    "ARCHITECTURES",
+    "Channels",
+    "ConvNet",
+    "ConvNetSettings",
+    "NetworkTable",
+    "RadialNet",
+    "RadialNetSettings",
+    "WallInputs",
+]
 
-SETTINGS = (ConvNetSettings, RadialNetSettings)
-ARCHITECTURES = {settings.model_fields["architecture"].default: settings for settings in SETTINGS}
-NetworkTable = Annotated[Union[SETTINGS], Field(discriminator="architecture")]  # noqa: UP007, of the list above
+NetworkTable = Annotated[ConvNetSettings | RadialNetSettings, Field(discriminator="architecture")]
+ARCHITECTURES: dict[str, type[NetworkSettings]] = {
+    settings.model_fields["architecture"].default: settings for settings in get_args(get_args(NetworkTable)[0])
+}

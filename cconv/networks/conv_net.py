@@ -3,7 +3,8 @@
 Source: Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020), section 4.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -12,7 +13,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from cconv.errors import ConfigError, check_choice
+from cconv.errors import check_choice
 from cconv.neighbors import Edges
 from cconv.networks.counting import (
     FLOAT,
@@ -24,26 +25,34 @@ from cconv.networks.counting import (
     window_arrays,
 )
 from cconv.networks.network import (
+    Channels,
     ConvolutionSettings,
     LinearTerms,
     Network,
+    WallInputs,
     assign_rows,
     check_single_layer,
-    check_walls,
+    module_list,
+    with_inputs,
 )
 from cconv.nn.continuous_conv import MESSAGES, ContinuousConv, ConvGeometry
 from cconv.nn.kinds import Kinds, split_kinds
 from cconv.ops.convolution import columns
 from cconv.validation import Flag, Whole
 
-ACTIVATIONS = {"relu": F.relu, "gelu": F.gelu, "tanh": torch.tanh, "leaky_relu": F.leaky_relu}
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": F.relu,
+    "gelu": F.gelu,
+    "tanh": torch.tanh,
+    "leaky_relu": F.leaky_relu,
+}
 SKIPS = ("before_activation", "after_activation", "none")
 
 
-class ConvNet(Network):
+class ConvNet(Network[ConvGeometry]):
     """Particle network of the thesis, figure 3.1.
 
-    Layer 0 concatenates boundary convolution, fluid convolution and fully connected layer, each of `layer_channels[0]`
+    Layer 0 concatenates boundary convolution, fluid convolution and fully connected layer, each of `channels.layers[0]`
     outputs. Every further layer k adds a convolution and a fully connected layer of the activated output before it;
     where the widths of z_k and z_{k-1} agree, z_{k-1} is added too. A network of one layer adds its branches instead
     of concatenating them. The last layer has no activation.
@@ -52,71 +61,60 @@ class ConvNet(Network):
     only one of two that are added has.
 
     Args:
-        in_channels: Features of a fluid particle.
-        layer_channels: Outputs of each layer, the last one the network's.
-        kernel_size: Cells of the filter grid, one number or one for each axis.
-        dim: Number of space dimensions D.
-        boundary_channels: Features of a boundary point; 0 builds no boundary branch.
+        channels: Features of a fluid particle, of a wall point and of each layer; `own` counts the last inputs.
+        kernel_size: Cells of the filter grid along each axis, (depth, height, width), in 2D (height, width).
         activation: "relu", "gelu", "tanh" or "leaky_relu".
         message: "absolute" or "difference", of all fluid convolutions.
         skip: What a skip connection carries: z_{k-1} "before_activation" (the published code), "after_activation"
             (the thesis's code) or "none".
         initialization: "xavier_uniform" with zero biases; "open3d": convolutions uniform in ±0.05; "thesis": weights of
             fully connected layers zero, as the text of thesis section 4.1 says.
-        own_channels: How many features, the last ones, layer 0's fully connected layer takes; None for all. Without any
-            there is no such layer.
         bias: Whether there are biases; without them equal features give 0 by differences.
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
-        ConfigError: If a name is unknown or there is no layer.
+        ConfigError: If a name is unknown.
     """
 
     def __init__(
         self,
-        in_channels: int,
-        layer_channels: tuple[int, ...],
-        kernel_size: int | tuple[int, ...],
-        dim: int,
+        channels: Channels[int],
+        kernel_size: tuple[int, ...],
         *,
-        boundary_channels: int = 0,
         activation: str = "relu",
         message: str = "absolute",
         skip: str = "before_activation",
         initialization: str = "xavier_uniform",
-        own_channels: int | None = None,
         bias: bool = True,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         check_choice("activation", activation, ACTIVATIONS)
         check_choice("skip", skip, SKIPS)
-        if not layer_channels:
-            raise ConfigError("`layer_channels` must name at least one layer, got none.")
-        self.activation, self.skip = activation, skip
-        first, *rest = layer_channels
-        self.own_channels = in_channels if own_channels is None else own_channels
-        common = {"initialization": initialization, "generator": generator}
-        of_branch = bias and (
-            message == "absolute" or bool(rest)
-        )  # branches of layer 0 are side by side if more follow
-        of_added = bias and message == "absolute"
-        self.boundary_conv = (
-            ContinuousConv(boundary_channels, first, kernel_size, dim, bias=of_branch, **common)
-            if boundary_channels
-            else None
+        self.activation, self.skip, self.own_channels = activation, skip, channels.mapped
+        first, *rest = channels.layers
+        conv_of = partial(
+            ContinuousConv,
+            kernel_size=kernel_size,
+            dim=len(kernel_size),
+            initialization=initialization,
+            generator=generator,
         )
-        widths = [(1 + bool(boundary_channels) + bool(self.own_channels)) * first, *rest]
-        self.convs = nn.ModuleList(
-            ContinuousConv(inputs, outputs, kernel_size, dim, bias=has_bias, message=message, **common)
+        of_branch = bias and (message == "absolute" or bool(rest))  # they stand side by side if more layers follow
+        of_added = bias and message == "absolute"
+        self.boundary_conv = None if channels.walls is None else conv_of(channels.walls, first, bias=of_branch)
+        widths = [(1 + (channels.walls is not None) + bool(self.own_channels)) * first, *rest]
+        self.convs = module_list(
+            conv_of(inputs, outputs, bias=has_bias, message=message)
             for inputs, outputs, has_bias in [
-                (in_channels, first, of_branch),
+                (channels.inputs, first, of_branch),
                 *((*both, of_added) for both in pairwise(widths)),
             ]
         )
         of_first = [(self.own_channels, first)] if self.own_channels else []
-        self.dense = nn.ModuleList(
-            _linear(inputs, outputs, bias=bias, **common) for inputs, outputs in [*of_first, *pairwise(widths)]
+        self.dense = module_list(
+            _linear(inputs, outputs, bias, initialization, generator)
+            for inputs, outputs in [*of_first, *pairwise(widths)]
         )
 
     @property
@@ -129,20 +127,14 @@ class ConvNet(Network):
         return features[:, features.shape[1] - self.own_channels :]
 
     def forward(
-        self,
-        features: Tensor,
-        geometry: ConvGeometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: ConvGeometry | None = None,
+        self, features: Tensor, geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
     ) -> Tensor:
-        """Outputs (N, C_out) at the fluid particles, of features (N, C_in) and (B, C_boundary); see `Network`."""
-        check_walls(self.boundary_conv is not None, wall_features, wall_geometry)
-        branches = [self.convs[0](features, geometry)]
+        """Outputs (N, C_out) at the fluid particles, of features (N, C_in) and (B, C_wall); see `Network`."""
+        branches = [conv(*seen) for conv, seen in with_inputs(self.boundary_conv, walls)]
+        branches.append(self.convs[0](features, geometry))
         if self.own_dense is not None:
             branches.append(self.own_dense(self.own(features)))
-        if self.boundary_conv is not None:
-            branches.insert(0, self.boundary_conv(wall_features, wall_geometry))
-        output = torch.cat(branches, dim=1) if len(self.convs) > 1 else sum(branches)
+        output = torch.cat(branches, dim=1) if len(self.convs) > 1 else sum(branches[1:], start=branches[0])
         for conv, dense in zip(self.convs[1:], self.dense[bool(self.own_channels) :], strict=True):
             output = self._layer(output, conv, dense, geometry)
         return output
@@ -160,9 +152,7 @@ class ConvNet(Network):
         return GridTerms(self)
 
 
-def _linear(
-    inputs: int, outputs: int, *, bias: bool, initialization: str, generator: torch.Generator | None
-) -> nn.Linear:
+def _linear(inputs: int, outputs: int, bias: bool, initialization: str, generator: torch.Generator | None) -> nn.Linear:
     layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
     if bias:
         nn.init.zeros_(layer.bias)
@@ -173,26 +163,21 @@ def _linear(
     return layer
 
 
-class GridTerms(LinearTerms):
+class GridTerms(LinearTerms[ConvGeometry]):
     """The single layer of a `ConvNet` as a linear map of its coefficients."""
 
     def __init__(self, network: ConvNet):
         self.network = network
 
     def terms(
-        self,
-        features: Tensor,
-        geometry: ConvGeometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: ConvGeometry | None = None,
+        self, features: Tensor, geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
     ) -> list[Tensor]:
         """Terms (N, P): columns of the boundary and the fluid, a particle's own features, one; those that there are."""
         own = MESSAGES[self.network.convs[0].message]
-        parts = [columns(features, geometry.reads, own), self.network.own(features)]
+        parts = [] if walls is None else [columns(walls.features, walls.geometry.reads)]
+        parts += [columns(features, geometry.reads, own), self.network.own(features)]
         if self._bias is not None:
             parts.append(torch.ones_like(features[:, :1]))
-        if wall_features is not None:
-            parts.insert(0, columns(wall_features, wall_geometry.reads))
         return [torch.cat(parts, dim=1)]
 
     def targets(self, target: Tensor) -> list[Tensor]:
@@ -204,7 +189,7 @@ class GridTerms(LinearTerms):
         """Make coefficients (P, C) those of the network."""
         (values,) = coefficients
         convs = [conv for conv in (self.network.boundary_conv, self.network.convs[0]) if conv is not None]
-        weights = [conv.filters for conv in convs]
+        weights: list[Tensor] = [conv.filters for conv in convs]
         if self.network.own_dense is not None:
             weights.append(self.network.own_dense.weight.T)
         for bias in (conv.bias for conv in convs if conv.bias is not None):
@@ -243,17 +228,19 @@ class ConvNetSettings(ConvolutionSettings):
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> ConvNet:
         """The network with fresh weights; arguments as of `NetworkSettings.build`."""
-        return ConvNet(
+        channels = Channels(
             self.sent(inputs).num_values(dim),
             (*self.hidden_widths, outputs.num_values(dim)),
-            self.kernel_size,
-            dim,
-            boundary_channels=0 if walls is None else walls.num_values(dim),
+            walls=None if walls is None else walls.num_values(dim),
+            own=self.own(inputs, outputs).num_values(dim) if self.takes_differences else None,
+        )
+        return ConvNet(
+            channels,
+            (self.kernel_size,) * dim,
             activation=self.activation,
             message=self.message,
             skip=self.skip,
             initialization=self.initialization,
-            own_channels=self.own(inputs, outputs).num_values(dim) if self.takes_differences else None,
             bias=self.has_intercept(outputs),
             generator=generator,
         )

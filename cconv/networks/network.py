@@ -1,8 +1,9 @@
 """What every network has: settings that build it, its geometry, its counted cost, and, if linear, its terms."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Generic, Literal, NamedTuple, TypeVar, cast
 
 import torch
 from pydantic import Field
@@ -26,19 +27,63 @@ from cconv.nn.radial_conv import RadialGeometry
 from cconv.validation import Flag, Real, StrictModel, Whole
 
 Geometry = ConvGeometry | RadialGeometry
+GeometryT = TypeVar("GeometryT", bound=Geometry)
+Layer = TypeVar("Layer", bound=nn.Module)
+Width = TypeVar("Width", int, Kinds)
 
 
-class LinearTerms(ABC):
+@dataclass(frozen=True)
+class Channels(Generic[Width]):
+    """How wide a network is: numbers of features, or of scalars and vectors.
+
+    Attributes:
+        inputs: What a fluid particle carries.
+        layers: Outputs of each layer, those of the last one the network's.
+        walls: What a wall point carries; None builds no branch for walls.
+        own: How many of the inputs, the last scalars and the first vectors, the first layer's linear map takes; None
+            for all. Without any there is no such map.
+
+    Raises:
+        ConfigError: If there is no layer.
+    """
+
+    inputs: Width
+    layers: tuple[Width, ...]
+    walls: Width | None = None
+    own: Width | None = None
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise ConfigError("`layers` must name the outputs of at least one layer, got none.")
+
+    @property
+    def mapped(self) -> Width:
+        """What the first layer's linear map takes."""
+        return self.inputs if self.own is None else self.own
+
+
+class WallInputs(NamedTuple, Generic[GeometryT]):
+    """What a network sees of the walls.
+
+    Attributes:
+        features: Features of the wall points (B, C).
+        geometry: Wall points seen from fluid particles.
+    """
+
+    features: Tensor
+    geometry: GeometryT
+
+
+def module_list(layers: Iterable[Layer]) -> Sequence[Layer]:
+    """Register layers in an `nn.ModuleList` and keep their type, which torch's list forgets."""
+    return cast(Sequence[Layer], nn.ModuleList(layers))
+
+
+class LinearTerms(ABC, Generic[GeometryT]):
     """A network of a single layer as a linear map of its coefficients, for least squares."""
 
     @abstractmethod
-    def terms(
-        self,
-        features: Tensor,
-        geometry: Geometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: Geometry | None = None,
-    ) -> list[Tensor]:
+    def terms(self, features: Tensor, geometry: GeometryT, walls: WallInputs[GeometryT] | None = None) -> list[Tensor]:
         """Sets of terms (R, P): an output is terms @ coefficients. Arguments as of `Network.forward`."""
 
     @abstractmethod
@@ -57,24 +102,17 @@ def assign_rows(weights: Sequence[Tensor], values: Tensor) -> None:
         weight.copy_(part.reshape(weight.shape))
 
 
-class Network(nn.Module, ABC):
+class Network(nn.Module, ABC, Generic[GeometryT]):
     """Maps features of fluid particles, and of walls, to outputs at the fluid particles."""
 
     @abstractmethod
-    def forward(
-        self,
-        features: Tensor,
-        geometry: Geometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: Geometry | None = None,
-    ) -> Tensor:
+    def forward(self, features: Tensor, geometry: GeometryT, walls: WallInputs[GeometryT] | None = None) -> Tensor:
         """Outputs at the fluid particles.
 
         Args:
             features: Features of fluid particles, as `NetworkSettings.arrange` gives them.
             geometry: Fluid particles seen from fluid particles.
-            wall_features: Features of wall points, only with a branch for walls.
-            wall_geometry: Wall points seen from fluid particles, only with a branch for walls.
+            walls: Wall points, only with a branch for walls.
 
         Returns:
             Scalars and vectors of the last layer, (N, S + V · D).
@@ -84,7 +122,7 @@ class Network(nn.Module, ABC):
         """
 
     @abstractmethod
-    def linear_terms(self) -> LinearTerms:
+    def linear_terms(self) -> LinearTerms[GeometryT]:
         """The network as a linear map of its coefficients.
 
         Raises:
@@ -92,17 +130,20 @@ class Network(nn.Module, ABC):
         """
 
 
-def check_walls(has_branch: bool, wall_features: Tensor | None, wall_geometry: Geometry | None) -> None:
-    """Check that inputs of walls come exactly where a network has a branch for them.
+def with_inputs(branch: Layer | None, walls: WallInputs[GeometryT] | None) -> list[tuple[Layer, WallInputs[GeometryT]]]:
+    """Pair a network's branch for walls, if it has one, with what it sees of them.
 
     Raises:
-        ShapeError: If not.
+        ShapeError: If there are inputs without a branch, or a branch without inputs.
     """
-    if has_branch != (wall_features is not None and wall_geometry is not None):
+    if branch is None and walls is None:
+        return []
+    if branch is None or walls is None:
         raise ShapeError(
-            "`wall_features` and `wall_geometry` must be given exactly when the network has a boundary branch; it has "
-            f"{'one' if has_branch else 'none'}."
+            "`walls` must be given exactly when the network has a boundary branch; it has "
+            f"{'none' if branch is None else 'one'}."
         )
+    return [(branch, walls)]
 
 
 def check_single_layer(layers: int) -> None:
@@ -169,7 +210,7 @@ class ConvolutionSettings(NetworkSettings):
     """
 
     linear_with = {"layers": 1}
-    linear_settings = ("relative_cutoff", "window", "normalize", "message")
+    linear_settings: ClassVar[tuple[str, ...]] = ("relative_cutoff", "window", "normalize", "message")
 
     layers: Whole = Field(4, ge=1, le=16)
     first_channels: Whole = Field(32, ge=1, le=4096)

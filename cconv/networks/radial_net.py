@@ -1,13 +1,14 @@
 """RadialNet: radial convolutions and linear maps in parallel, equivariant to rotations and reflections as a whole."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from cconv.errors import ConfigError, check_choice
+from cconv.errors import check_choice
 from cconv.neighbors import Edges
 from cconv.networks.conv_net import ACTIVATIONS
 from cconv.networks.counting import (
@@ -22,20 +23,21 @@ from cconv.networks.counting import (
     window_arrays,
 )
 from cconv.networks.network import (
+    Channels,
     ConvolutionSettings,
     LinearTerms,
     Network,
+    WallInputs,
     assign_rows,
     check_single_layer,
-    check_walls,
+    module_list,
+    with_inputs,
 )
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.nn.radial_conv import RadialConv, RadialGeometry
 from cconv.ops.convolution import columns
 from cconv.ops.radial import MOST_OUTPUTS
 from cconv.validation import Whole
-
-NO_VALUES = Kinds(0, 0)
 
 
 class VectorLinear(nn.Module):
@@ -59,8 +61,8 @@ class VectorLinear(nn.Module):
     ):
         super().__init__()
         self.in_channels, self.dim = in_channels, dim
-        self.scalar_weights = nn.Parameter(torch.zeros(in_channels[0], out_channels[0]))
-        self.vector_weights = nn.Parameter(torch.zeros(in_channels[1], out_channels[1]))
+        self.scalar_weights = nn.Parameter(torch.zeros(in_channels.scalars, out_channels.scalars))
+        self.vector_weights = nn.Parameter(torch.zeros(in_channels.vectors, out_channels.vectors))
         self.bias = nn.Parameter(torch.zeros(out_channels[0])) if bias else None
         for weights in (self.scalar_weights, self.vector_weights):
             if weights.numel():
@@ -74,7 +76,7 @@ class VectorLinear(nn.Module):
         return join_kinds(linear if self.bias is None else linear + self.bias, mapped)
 
 
-class RadialNet(Network):
+class RadialNet(Network[RadialGeometry]):
     """Network of scalars and vectors.
 
     Every layer adds a radial convolution and a linear map of its input, the first one a convolution of the boundary
@@ -82,59 +84,45 @@ class RadialNet(Network):
     pass the activation, and each vector is multiplied with the sigmoid of a scalar that its layer computes for it.
 
     Args:
-        in_channels: Scalars and vectors of a fluid particle.
-        layer_channels: Scalars and vectors of each layer, the last one the network's outputs.
+        channels: Scalars and vectors of a fluid particle, of a wall point and of each layer.
         num_terms: Number of radial terms B.
         dim: Number of space dimensions D.
-        boundary_channels: Scalars and vectors of a boundary point; (0, 0) builds no boundary branch.
         activation: "relu", "gelu", "tanh" or "leaky_relu", of scalars.
         message: "absolute" or "difference", of all fluid convolutions.
         residual: Whether outputs of layers of equal width are added up.
-        own_channels: How many scalars, the last ones, and vectors the first layer's linear map takes; None for all.
-            Without any there is no such map.
         bias: Whether scalars have biases; without them equal features give 0 by differences.
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
-        ConfigError: If a name is unknown or there is no layer.
+        ConfigError: If a name is unknown.
     """
 
     def __init__(
         self,
-        in_channels: Kinds,
-        layer_channels: tuple[Kinds, ...],
+        channels: Channels[Kinds],
         num_terms: int,
         dim: int,
         *,
-        boundary_channels: Kinds = NO_VALUES,
         activation: str = "relu",
         message: str = "absolute",
         residual: bool = True,
-        own_channels: Kinds | None = None,
         bias: bool = True,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         check_choice("activation", activation, ACTIVATIONS)
-        if not layer_channels:
-            raise ConfigError("`layer_channels` must name at least one layer, got none.")
         self.activation, self.residual, self.dim = activation, residual, dim
-        *hidden, last = layer_channels
-        self.hidden_channels = hidden
-        self.own_channels = in_channels if own_channels is None else own_channels
-        inputs = [in_channels, *hidden]
-        outputs = [*((scalars + vectors, vectors) for scalars, vectors in hidden), last]  # a gate for each vector
-        self.boundary_conv = (
-            RadialConv(boundary_channels, outputs[0], num_terms, dim, bias=False, generator=generator)
-            if any(boundary_channels)
-            else None
-        )
-        self.convs = nn.ModuleList(
-            RadialConv(before, after, num_terms, dim, bias=False, message=message, generator=generator)
-            for before, after in zip(inputs, outputs, strict=True)
+        *hidden, last = channels.layers
+        self.hidden_channels, self.own_channels = hidden, channels.mapped
+        inputs = [channels.inputs, *hidden]
+        outputs = [*(Kinds(scalars + vectors, vectors) for scalars, vectors in hidden), last]  # a gate for each vector
+        conv_of = partial(RadialConv, num_terms=num_terms, dim=dim, bias=False, generator=generator)
+        self.boundary_conv = None if channels.walls is None else conv_of(channels.walls, outputs[0])
+        self.convs = module_list(
+            conv_of(before, after, message=message) for before, after in zip(inputs, outputs, strict=True)
         )
         mapped = zip([self.own_channels, *hidden], outputs, strict=True)
-        self.dense = nn.ModuleList(
+        self.dense = module_list(
             VectorLinear(before, after, dim, bias, generator) for before, after in mapped if any(before)
         )
 
@@ -145,23 +133,19 @@ class RadialNet(Network):
 
     def own(self, features: Tensor) -> Tensor:
         """What that map takes of features (N, S + V · D)."""
+        own = self.own_channels
         scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
-        return join_kinds(scalars[:, scalars.shape[1] - self.own_channels[0] :], vectors[:, : self.own_channels[1]])
+        return join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
 
     def forward(
-        self,
-        features: Tensor,
-        geometry: RadialGeometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: RadialGeometry | None = None,
+        self, features: Tensor, geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
     ) -> Tensor:
         """Scalars and vectors of the last layer, (N, S + V · D), of such values of its inputs; see `Network`."""
-        check_walls(self.boundary_conv is not None, wall_features, wall_geometry)
         output = self.convs[0](features, geometry)
         if self.own_dense is not None:
             output = output + self.own_dense(self.own(features))
-        if self.boundary_conv is not None:
-            output = output + self.boundary_conv(wall_features, wall_geometry)
+        for conv, seen in with_inputs(self.boundary_conv, walls):
+            output = output + conv(*seen)
         following_dense = self.dense[any(self.own_channels) :]
         for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
@@ -170,7 +154,7 @@ class RadialNet(Network):
         return output
 
     def _activate(self, values: Tensor, channels: Kinds) -> Tensor:
-        scalars, vectors = split_kinds(values, (sum(channels), channels[1]), self.dim)
+        scalars, vectors = split_kinds(values, Kinds(sum(channels), channels.vectors), self.dim)
         passed, gates = scalars.split(channels, dim=1)
         return join_kinds(ACTIVATIONS[self.activation](passed), torch.sigmoid(gates)[:, :, None] * vectors)
 
@@ -180,24 +164,18 @@ class RadialNet(Network):
         return RadialTerms(self)
 
 
-class RadialTerms(LinearTerms):
+class RadialTerms(LinearTerms[RadialGeometry]):
     """The single layer of a `RadialNet` as a linear map of its coefficients: scalars apart from vectors."""
 
     def __init__(self, network: RadialNet):
         self.network = network
 
     def terms(
-        self,
-        features: Tensor,
-        geometry: RadialGeometry,
-        wall_features: Tensor | None = None,
-        wall_geometry: RadialGeometry | None = None,
+        self, features: Tensor, geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
     ) -> list[Tensor]:
         """Terms of the scalars (N, P) and of the components of the vectors (N · D, P'), where there are any."""
-        convolved = [(self.network.convs[0], features, geometry)]
-        if wall_features is not None:
-            convolved.insert(0, (self.network.boundary_conv, wall_features, wall_geometry))
-        gathered = [_radial_columns(*inputs) for inputs in convolved]
+        gathered = [_radial_columns(conv, *seen) for conv, seen in with_inputs(self.network.boundary_conv, walls)]
+        gathered.append(_radial_columns(self.network.convs[0], features, geometry))
         scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
         of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
         if self.network.own_dense is not None and self.network.own_dense.bias is not None:
@@ -217,16 +195,17 @@ class RadialTerms(LinearTerms):
         """Make coefficients (P, S) and (P', V) those of the network."""
         network, dense = self.network, self.network.own_dense
         convs = [conv for conv in (network.boundary_conv, network.convs[0]) if conv is not None]
-        weights = [[conv.scalar_filters for conv in convs], [conv.vector_filters for conv in convs]]
+        of_scalars: list[Tensor] = [conv.scalar_filters for conv in convs]
+        of_vectors: list[Tensor] = [conv.vector_filters for conv in convs]
         if dense is not None:
-            weights[0] += [dense.scalar_weights, *([] if dense.bias is None else [dense.bias[None]])]
-            weights[1] += [dense.vector_weights]
-        present = [kind for kind, count in zip(weights, self._out_channels, strict=True) if count]
+            of_scalars += [dense.scalar_weights, *([] if dense.bias is None else [dense.bias[None]])]
+            of_vectors += [dense.vector_weights]
+        present = [kind for kind, count in zip((of_scalars, of_vectors), self._out_channels, strict=True) if count]
         for tensors, values in zip(present, coefficients, strict=True):
             assign_rows(tensors, values)
 
     @property
-    def _out_channels(self) -> tuple[int, int]:
+    def _out_channels(self) -> Kinds:
         return self.network.convs[0].out_channels
 
 
@@ -251,16 +230,14 @@ class RadialNetSettings(ConvolutionSettings):
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> RadialNet:
         """The network with fresh weights; arguments as of `NetworkSettings.build`."""
+        layers = (*(Kinds(width, width) for width in self.hidden_widths), outputs)
         return RadialNet(
-            self.sent(inputs),
-            (*(Kinds(width, width) for width in self.hidden_widths), outputs),
+            Channels(self.sent(inputs), layers, walls=walls, own=self.own(inputs, outputs)),
             self.radial_terms,
             dim,
-            boundary_channels=walls or NO_VALUES,
             activation=self.activation,
             message=self.message,
             residual=self.skip == "before_activation",
-            own_channels=self.own(inputs, outputs),
             bias=self.has_intercept(outputs),
             generator=generator,
         )

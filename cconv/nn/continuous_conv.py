@@ -125,7 +125,7 @@ def _filter_reads(
         row_splits=edges.row_splits,
         receivers=edges.receivers,
         senders=edges.senders,
-        cells=sum(stride * lowest[:, axis] for axis, stride in enumerate(strides(sizes))),
+        cells=sum(map(torch.mul, lowest.unbind(1), strides(sizes)), start=torch.zeros_like(lowest[:, 0])),
         fractions=fractions,
         weights=importance(edges, window, normalize) * factor,
         corner_offsets=torch.tensor(corners, dtype=torch.int32),

@@ -46,7 +46,8 @@ def _ball_to_cylinder(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, 
     on_side = norm / torch.where(cap | origin, 1.0, rho_squared).sqrt()
     scale = torch.where(cap, on_cap, on_side)
     height = torch.where(cap, torch.sign(z) * norm, 1.5 * z)
-    return tuple(torch.where(origin, 0.0, value) for value in (scale * x, scale * y, height))
+    x, y, z = (torch.where(origin, 0.0, value) for value in (scale * x, scale * y, height))
+    return x, y, z
 
 
 def _disk_to_square(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,10 +17,10 @@ class Kinds(NamedTuple):
         return self.scalars + self.vectors * dim
 
 
-def split_kinds(values: Tensor, kinds: tuple[int, int], dim: int) -> tuple[Tensor, Tensor]:
+def split_kinds(values: Tensor, kinds: Kinds, dim: int) -> tuple[Tensor, Tensor]:
     """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
-    scalars, vectors = values.split([kinds[0], kinds[1] * dim], dim=1)
-    return scalars, vectors.reshape(len(values), kinds[1], dim)
+    scalars, vectors = values.split([kinds.scalars, kinds.vectors * dim], dim=1)
+    return scalars, vectors.reshape(len(values), kinds.vectors, dim)
 
 
 def join_kinds(scalars: Tensor, vectors: Tensor) -> Tensor:

@@ -148,7 +148,7 @@ class RadialGeometry:
         directed = torch.cat([scalars, along], dim=1)[:, :, None] * self.directions[:, None, :]
         to_scalars = torch.cat([scalars, along], dim=1)
         # Directed scalars, vectors, directed projections.
-        to_vectors = torch.cat([directed[:, : channels[0]], vectors, directed[:, channels[0] :]], dim=1)
+        to_vectors = torch.cat([directed[:, : channels.scalars], vectors, directed[:, channels.scalars :]], dim=1)
         return to_scalars, to_vectors.permute(2, 0, 1)
 
 
@@ -180,12 +180,12 @@ class RadialConv(nn.Module):
     ):
         super().__init__()
         check_choice("message", message, MESSAGES)
-        self.in_channels, self.out_channels = Kinds(*in_channels), Kinds(*out_channels)
+        self.in_channels, self.out_channels = in_channels, out_channels
         self.dim, self.message = dim, message
         scalars, vectors = in_channels
-        self.scalar_filters = uniform_filters((num_terms,), scalars + vectors, out_channels[0], generator)
-        self.vector_filters = uniform_filters((num_terms,), scalars + 2 * vectors, out_channels[1], generator)
-        self.bias = nn.Parameter(torch.zeros(out_channels[0])) if bias else None
+        self.scalar_filters = uniform_filters((num_terms,), scalars + vectors, out_channels.scalars, generator)
+        self.vector_filters = uniform_filters((num_terms,), scalars + 2 * vectors, out_channels.vectors, generator)
+        self.bias = nn.Parameter(torch.zeros(out_channels.scalars)) if bias else None
 
     def forward(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
         """Values (M, S_in + V_in · D) of the senders to (N, S_out + V_out · D) at the receivers.
@@ -213,7 +213,7 @@ class RadialConv(nn.Module):
         """Any device and dtype, differentiable: convolutions of what each edge sends."""
         to_scalars, to_vectors = geometry.messages(features, self.in_channels, self.message)
         scalars = convolve(to_scalars, self.scalar_filters, geometry.reads)
-        if self.out_channels[1] == 0:
+        if self.out_channels.vectors == 0:
             return scalars
         vectors = [convolve(component, self.vector_filters, geometry.reads) for component in to_vectors]
         return join_kinds(scalars, torch.stack(vectors, dim=2))

@@ -15,6 +15,7 @@ Otherwise dF is read from products dY W_kᵀ, and dW_k = (S_k F)ᵀ dY from colu
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,13 +53,15 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
 
 class _BlockedConv(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features: Tensor, filters: Tensor, reads: FilterReads, own: float, compute: Callable) -> Tensor:
+    def forward(
+        ctx: Any, features: Tensor, filters: Tensor, reads: FilterReads, own: float, compute: Callable
+    ) -> Tensor:
         ctx.save_for_backward(features, filters)
         ctx.reads, ctx.own = reads, own
         return compute(features.detach().contiguous(), filters.detach(), reads, own)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         features, filters = ctx.saved_tensors
         of_features, of_filters = ctx.needs_input_grad[:2]
         if torch.is_grad_enabled():  # the derivative is to be differentiated again

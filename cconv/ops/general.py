@@ -8,7 +8,7 @@ from torch import Tensor
 from cconv.ops.filter_reads import FilterReads
 
 
-def multiplies_first(num_senders: int, num_receivers: int, in_channels: int, out_channels: int) -> bool:
+def multiplies_first(num_senders: float, num_receivers: float, in_channels: int, out_channels: int) -> bool:
     """Whether products of the senders are so much narrower than columns of the receivers that they come first."""
     return 4 * num_senders * out_channels <= num_receivers * in_channels
 

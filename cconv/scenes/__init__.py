@@ -1,5 +1,8 @@
 """Scenes of fluid dynamics: particles, walls, forces, solver settings, and what a scene has."""
 
+import math
+from typing import Any
+
 from cconv.errors import check_choice
 from cconv.scenes.cuboid_3d import Cuboid3D
 from cconv.scenes.dam_break_2d import DamBreak2D
@@ -27,7 +30,7 @@ SCENES: dict[str, type[SimulatedScene]] = {
 }
 
 
-def scene_named(name: str, size: str = "published", **settings) -> SimulatedScene:
+def scene_named(name: str, size: str = "published", **settings: Any) -> SimulatedScene:
     """A scene at one of its sizes.
 
     Args:
@@ -43,5 +46,5 @@ def scene_named(name: str, size: str = "published", **settings) -> SimulatedScen
     check_choice("size", size, scene.sizes)
     given = {key: value for key, value in settings.items() if value is not None}
     if given.keys() & {"particle_spacing", "viscosity"}:
-        given.setdefault("time_step", None)  # the size's own belongs to its own spacing and viscosity
+        given.setdefault("time_step", math.inf)  # the size's own belongs to its own spacing and viscosity
     return scene(**{**scene.sizes[size], **given})

@@ -119,8 +119,8 @@ class Cuboid3D(SimulatedScene):
 
 
 def _uniform(generator: torch.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Tensor:
-    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (low, high))
-    return low + (high - low) * torch.rand(len(low), generator=generator, dtype=torch.float64)
+    lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (low, high))
+    return lower + (upper - lower) * torch.rand(len(low), generator=generator, dtype=torch.float64)
 
 
 def _rotation(generator: torch.Generator) -> Tensor:

@@ -26,7 +26,7 @@ class DamBreak2D(SimulatedScene):
 
     particle_spacing: float = 0.02
     viscosity: float = 5e-5
-    time_step: float | None = 3e-4
+    time_step: float = 3e-4
     num_frames: int = 401
     num_trajectories: int = 100
     column: tuple[float, float] = (2.0, 1.0)
@@ -64,8 +64,7 @@ class DamBreak2D(SimulatedScene):
     @property
     def box(self) -> Box:
         """The tank within its walls, and a tenth of room above and beside them, as published."""
-        upper = (length + 2 * self.wall_thickness + 0.1 for length in self.tank)
-        return Box((0.0, 0.0), upper)
+        return Box((0.0, 0.0), [length + 2 * self.wall_thickness + 0.1 for length in self.tank])
 
     @property
     def walls(self) -> Walls:

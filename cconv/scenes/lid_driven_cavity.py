@@ -5,6 +5,7 @@ Source: Ghia, Ghia, Shin, "High-Re solutions for incompressible flow" (1982); se
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ class _LidDrivenCavity(SimulatedScene):
 
     case = "LDC"
     background_pressure = 0.01
-    depth = ()
+    depth: ClassVar[tuple[float, ...]] = ()
 
     @property
     def _corner(self) -> tuple[float, ...]:
@@ -69,7 +70,7 @@ class LidDrivenCavity2D(_LidDrivenCavity):
     """In two dimensions."""
 
     particle_spacing: float = 0.02
-    time_step: float | None = 4e-4
+    time_step: float = 4e-4
     num_frames: int = 20_000
     skipped_frames: int = 1248
 
@@ -94,7 +95,7 @@ class LidDrivenCavity3D(_LidDrivenCavity):
     """In three dimensions, depth 0.5."""
 
     particle_spacing: float = 1 / 24
-    time_step: float | None = 9e-4
+    time_step: float = 9e-4
     num_frames: int = 20_000
     skipped_frames: int = 555
 

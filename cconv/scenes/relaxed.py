@@ -10,7 +10,7 @@ from torch import Tensor
 from cconv.domain import Box
 from cconv.scenes.walls import Walls, lattice
 from cconv.sph.kernels import QuinticSpline
-from cconv.sph.solver import EquationOfState, WeaklyCompressibleSPH, largest_time_step
+from cconv.sph.solver import EquationOfState, Scheme, WeaklyCompressibleSPH, largest_time_step
 
 _JITTER = 0.3  # largest displacement from the lattice along an axis, in spacings
 _VISCOSITY = 0.2  # in spacings times the speed of sound: motion dies out within some tens of steps
@@ -38,7 +38,7 @@ def relaxed(
         box=box,
         particle_spacing=spacing,
         equation_of_state=eos,
-        transport_pressure=eos.reference_pressure,
+        scheme=Scheme(transport_pressure=eos.reference_pressure),
     )
     state = solver.initial_state(
         shaken,

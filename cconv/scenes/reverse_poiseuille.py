@@ -5,6 +5,7 @@ LagrangeBench (Toshev et al., 2023), 2D_RPF_3200_20kevery100 and 3D_RPF_8000_10k
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ class _ReversePoiseuille(SimulatedScene):
     num_trajectories: int = 1
 
     case = "RPF"
-    depth = ()
+    depth: ClassVar[tuple[float, ...]] = ()
 
     @property
     def box(self) -> Box:
@@ -53,7 +54,7 @@ class ReversePoiseuille2D(_ReversePoiseuille):
     """Reynolds number 10."""
 
     particle_spacing: float = 0.025
-    time_step: float | None = 5e-4
+    time_step: float = 5e-4
     num_frames: int = 40_000
     skipped_frames: int = 998
 
@@ -79,7 +80,7 @@ class ReversePoiseuille3D(_ReversePoiseuille):
     """Reynolds number 10, depth 0.5."""
 
     particle_spacing: float = 0.05
-    time_step: float | None = 1e-3
+    time_step: float = 1e-3
     num_frames: int = 20_000
     skipped_frames: int = 498
 

@@ -17,6 +17,7 @@ from cconv.sph.kernels import QuinticSpline
 from cconv.sph.solver import (
     EquationOfState,
     ParticleState,
+    Scheme,
     WeaklyCompressibleSPH,
     check_time_step,
     largest_time_step,
@@ -30,7 +31,7 @@ class SimulatedScene(ABC):
     Attributes:
         particle_spacing: dx.
         viscosity: Kinematic viscosity ν.
-        time_step: Of the solver; None for the largest that the CFL conditions allow.
+        time_step: Of the solver; infinity for the largest that the CFL conditions allow.
         steps_per_frame: Steps between stored frames.
         num_frames: Stored frames of a trajectory, the start included.
         skipped_frames: Frames before the first that is stored, until the flow has developed.
@@ -57,7 +58,7 @@ class SimulatedScene(ABC):
 
     particle_spacing: float
     viscosity: float
-    time_step: float | None = None
+    time_step: float = math.inf
     steps_per_frame: int = 100
     num_frames: int = 101
     skipped_frames: int = 0
@@ -85,7 +86,7 @@ class SimulatedScene(ABC):
         for name, least in (("steps_per_frame", 1), ("num_frames", 1), ("num_trajectories", 1), ("skipped_frames", 0)):
             if getattr(self, name) < least:
                 raise ConfigError(f"`{name}` must be at least {least}, got {getattr(self, name)}.")
-        if self.time_step is None:
+        if self.time_step == math.inf:
             object.__setattr__(self, "time_step", largest_time_step(**self._scales))
         check_time_step(self.time_step, **self._scales)
 
@@ -172,8 +173,9 @@ class SimulatedScene(ABC):
             box=self.box,
             particle_spacing=self.particle_spacing,
             equation_of_state=eos,
-            density=self.density_scheme,
-            artificial_viscosity=self.artificial_viscosity * 10 / eos.sound_speed,
+            scheme=Scheme(
+                density=self.density_scheme, artificial_viscosity=self.artificial_viscosity * 10 / eos.sound_speed
+            ),
             force=self.force if self.has_force else None,
         )
 

@@ -21,7 +21,7 @@ class TaylorGreen2D(SimulatedScene):
 
     particle_spacing: float = 0.02
     viscosity: float = 0.01
-    time_step: float | None = 4e-4
+    time_step: float = 4e-4
     num_frames: int = 126
     num_trajectories: int = 200
 
@@ -68,7 +68,7 @@ class TaylorGreen3D(SimulatedScene):
 
     particle_spacing: float = 2 * math.pi / 20
     viscosity: float = 0.02
-    time_step: float | None = 5e-3
+    time_step: float = 5e-3
     num_frames: int = 61
     num_trajectories: int = 400
 

@@ -11,7 +11,7 @@ from cconv.sph.kernels import (
     kernel_named,
 )
 from cconv.sph.operators import density, density_gradient, density_rate
-from cconv.sph.solver import EquationOfState, ParticleState, WeaklyCompressibleSPH
+from cconv.sph.solver import EquationOfState, ParticleState, Scheme, WeaklyCompressibleSPH
 
 __all__ = [
     "KERNELS",
@@ -21,6 +21,7 @@ __all__ = [
     "ParticleState",
     "Poly6",
     "QuinticSpline",
+    "Scheme",
     "WendlandC2",
     "WendlandC4",
     "WeaklyCompressibleSPH",

@@ -4,6 +4,7 @@ Kernels come from tables of cubic polynomials, within 1e-6 of their largest valu
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,9 +77,17 @@ class CompiledSums:
     def _slopes(self, like: Tensor) -> np.ndarray:
         return self._tables[_array(like).dtype.type][1]
 
-    def _sum(self, loop: Callable, edges: Edges, masses: Tensor, shape, table: np.ndarray, *others) -> Tensor:
+    def _sum(
+        self,
+        loop: Callable,
+        edges: Edges,
+        masses: Tensor,
+        shape: int | tuple[int, ...],
+        table: np.ndarray,
+        *others: Any,
+    ) -> Tensor:
         """Run a loop over the rows, shared out among workers."""
-        masses, output = _array(masses), np.zeros(shape, table.dtype)
+        senders_masses, output = _array(masses), np.zeros(shape, table.dtype)
         splits, senders = edges.row_splits.numpy(), edges.senders.numpy()
         pairs = (splits, senders, _array(edges.displacements), _array(edges.distances))
         scale = table.dtype.type((len(table) - 1) / self.kernel.support_radius)
@@ -87,7 +96,7 @@ class CompiledSums:
         bounds[0], bounds[-1] = 0, edges.num_receivers
 
         def work(worker: int) -> None:
-            loop(bounds[worker], bounds[worker + 1], *pairs, masses, scale, table, *others, output)
+            loop(bounds[worker], bounds[worker + 1], *pairs, senders_masses, scale, table, *others, output)
 
         run_on_workers(work, workers)
         return torch.from_numpy(output)

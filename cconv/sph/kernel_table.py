@@ -19,7 +19,8 @@ def kernel_tables(kernel: AbstractKernel) -> tuple[np.ndarray, np.ndarray]:
     last = np.nextafter(kernel.support_radius, 0)  # at the support itself W is 0, which for some kernels is a jump
     nodes = np.linspace(0, last, _INTERVALS + 1)
     powers = (kernel.support_radius / _INTERVALS) ** np.arange(3, -1, -1)
-    return tuple(
-        np.vstack([CubicSpline(nodes, values(torch.from_numpy(nodes)).numpy()).c.T * powers, np.zeros(4)])
-        for values in (kernel.value, kernel.derivative)
+    values, slopes = (
+        np.vstack([CubicSpline(nodes, function(torch.from_numpy(nodes)).numpy()).c.T * powers, np.zeros(4)])
+        for function in (kernel.value, kernel.derivative)
     )
+    return values, slopes

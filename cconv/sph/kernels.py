@@ -98,10 +98,10 @@ class QuinticSpline(AbstractKernel):
         return {1: 1 / 120, 2: 7 / (478 * math.pi), 3: 1 / (120 * math.pi)}[self.dim]
 
     def _profile(self, q: Tensor) -> Tensor:
-        return sum(factor * (knot - q).clamp_min(0) ** 5 for knot, factor in ((3, 1), (2, -6), (1, 15)))
+        return (3 - q).clamp_min(0) ** 5 - 6 * (2 - q).clamp_min(0) ** 5 + 15 * (1 - q).clamp_min(0) ** 5
 
     def _slope(self, q: Tensor) -> Tensor:
-        return sum(-5 * factor * (knot - q).clamp_min(0) ** 4 for knot, factor in ((3, 1), (2, -6), (1, 15)))
+        return -5 * (3 - q).clamp_min(0) ** 4 + 30 * (2 - q).clamp_min(0) ** 4 - 75 * (1 - q).clamp_min(0) ** 4
 
 
 class WendlandC2(AbstractKernel):

@@ -1,6 +1,7 @@
 """Neighbours of moving particles, searched anew only once these have moved, and loops over them on several threads."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ class Rows:
         inner = np.searchsorted(splits, np.linspace(0, len(neighbors), workers + 1)[1:-1])
         self._bounds = [0, *inner.tolist(), len(splits) - 1]
 
-    def visit(self, loop: Callable, *arguments) -> None:
+    def visit(self, loop: Callable, *arguments: Any) -> None:
         """Run a loop of `pair_loops` over all rows."""
         bounds = self._bounds
         run_on_workers(
@@ -43,7 +44,7 @@ class NeighborList:
         self._box, self._reach, self._skin = box, reach, skin
         self._lengths = periodic_lengths(box)
         self._searched_at, self._walls_then = np.empty((0, 3)), np.empty(0, bool)
-        self._found: Rows | None = None
+        self._found = Rows(np.zeros(1, np.int64), np.empty(0, np.int32))
 
     def rows(self, positions: np.ndarray, is_wall: np.ndarray) -> Rows:
         """Rows of all pairs with a fluid particle, of positions (N, 3) and which of them are walls (N,)."""

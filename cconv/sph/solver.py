@@ -18,6 +18,7 @@ Phys. 335 (2017), for the renormalisation; Toshev et al., "JAX-SPH" (2024), for 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -67,6 +68,34 @@ class EquationOfState:
         """ρ(p), the inverse."""
         ratio = (pressures - self.background_pressure) / self.reference_pressure + 1
         return self.rest_density * np.maximum(ratio, 0.0) ** (1 / self.exponent)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """Which variant of weakly compressible SPH a solver computes.
+
+    Attributes:
+        density: "summation" (D1; fluids without a free surface) or "evolution" (continuity equation).
+        renormalize_every: Steps between renormalisations of evolved densities by a Shepard filter; 0 for none.
+        transport_pressure: Pressure that spreads the particles evenly; 0 for particles that move with the fluid. Only
+            for fluids without a free surface, where c² ρ_0 is usual.
+        artificial_viscosity: α of the artificial viscosity between fluid particles.
+        wall_friction: Whether walls hold the fluid (no slip) or let it slip freely.
+
+    Raises:
+        ConfigError: If the density's name is unknown, or summed densities are to be renormalised.
+    """
+
+    density: str = "summation"
+    renormalize_every: int = 0
+    transport_pressure: float = 0.0
+    artificial_viscosity: float = 0.0
+    wall_friction: bool = True
+
+    def __post_init__(self) -> None:
+        check_choice("density", self.density, DENSITY_SCHEMES)
+        if self.density == "summation" and self.renormalize_every:
+            raise ConfigError("`renormalize_every` must be 0 with summed densities: only evolved ones drift.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +149,8 @@ def check_time_step(
 ) -> None:
     """Raise `ConfigError`, naming the condition, unless a time step is positive and at most `largest_time_step`."""
     scales = _time_scales(particle_spacing, sound_speed + reference_speed, viscosity, force)
-    condition = min(scales, key=scales.get)
-    limit = CFL * scales[condition]
+    condition, scale = min(scales.items(), key=itemgetter(1))
+    limit = CFL * scale
     if not 0 < time_step <= limit * (1 + 1e-9):
         raise ConfigError(
             f"`time_step` must be positive and at most {limit:.4g}, the limit set by {condition}, got {time_step:g}; "
@@ -146,12 +175,7 @@ class WeaklyCompressibleSPH:
         box: Domain with its periodic axes.
         particle_spacing: dx.
         equation_of_state: Pressure of the fluid.
-        density: "summation" (D1; fluids without a free surface) or "evolution" (continuity equation).
-        renormalize_every: Steps between renormalisations of evolved densities by a Shepard filter; 0 for none.
-        transport_pressure: Pressure that spreads the particles evenly; 0 for particles that move with the fluid. Only
-            for fluids without a free surface, where c² ρ_0 is usual.
-        artificial_viscosity: α of the artificial viscosity between fluid particles.
-        wall_friction: Whether walls hold the fluid (no slip) or let it slip freely.
+        scheme: Which variant of the method.
         force: External acceleration (N, D) at positions (N, D), or None.
         skin: Extra reach of the neighbour list, in particle spacings.
 
@@ -166,28 +190,19 @@ class WeaklyCompressibleSPH:
         box: Box,
         particle_spacing: float,
         equation_of_state: EquationOfState,
-        density: str = "summation",
-        renormalize_every: int = 0,
-        transport_pressure: float = 0.0,
-        artificial_viscosity: float = 0.0,
-        wall_friction: bool = True,
+        scheme: Scheme,
         force: Force | None = None,
         skin: float = 0.3,
     ):
-        check_choice("density", density, DENSITY_SCHEMES)
         if kernel.dim != box.dim:
             raise ConfigError(f"`kernel` must have the dimension of `box` ({box.dim}), got {kernel.dim}.")
         if not skin >= 0:
             raise ConfigError(f"`skin` must be at least 0, got {skin}.")
         _check_wide_enough(box, kernel.support_radius + skin * particle_spacing)
-        if density == "summation" and renormalize_every:
-            raise ConfigError("`renormalize_every` must be 0 with summed densities: only evolved ones drift.")
         self.box, self.particle_spacing, self.equation_of_state = box, particle_spacing, equation_of_state
         self._kernel, self._tables = kernel, kernel_tables(kernel)
-        self._density, self._renormalize_every = density, renormalize_every
-        self._transport_pressure, self._wall_friction = transport_pressure, wall_friction
-        self._artificial = artificial_viscosity * kernel.smoothing_length * equation_of_state.sound_speed
-        self._force = force
+        self._scheme, self._force = scheme, force
+        self._artificial = scheme.artificial_viscosity * kernel.smoothing_length * equation_of_state.sound_speed
         self._lengths, self._lower = periodic_lengths(box), np.zeros(3)
         self._lower[: box.dim] = box.lower
         self._neighbors = NeighborList(box, kernel.support_radius, skin * particle_spacing)
@@ -230,7 +245,7 @@ class WeaklyCompressibleSPH:
             viscosities=viscosities,
             is_wall=is_wall.clone(),
         )
-        if self._density == "evolution":
+        if self._scheme.density == "evolution":
             return state
         return replace(state, densities=torch.from_numpy(self._summed(_Arrays(state))))
 
@@ -278,8 +293,8 @@ class WeaklyCompressibleSPH:
         accelerations, shifts = np.zeros_like(now.positions), np.zeros_like(now.positions)
         rows.visit(
             pair_loops.accelerations, now.positions, self._lengths, now.masses, support, slopes, now.is_wall,
-            velocities, transport, densities, pressures, eos.rest_density * now.viscosities, self._wall_friction,
-            float(self._transport_pressure), self._artificial, 0.01 * self._kernel.smoothing_length**2,
+            velocities, transport, densities, pressures, eos.rest_density * now.viscosities, self._scheme.wall_friction,
+            float(self._scheme.transport_pressure), self._artificial, 0.01 * self._kernel.smoothing_length**2,
             accelerations, shifts,
         )  # fmt: skip
         return accelerations + np.where(now.is_wall[:, None], 0.0, force), shifts, densities
@@ -290,7 +305,7 @@ class WeaklyCompressibleSPH:
         return moved
 
     def _next_densities(self, now: "_Arrays", time_step: float, steps: int) -> np.ndarray:
-        if self._density == "summation":
+        if self._scheme.density == "summation":
             return self._summed(now)
         table, slopes = self._tables
         rows = self._neighbors.rows(now.positions, now.is_wall)
@@ -298,7 +313,7 @@ class WeaklyCompressibleSPH:
         rates = np.zeros_like(now.densities)
         rows.visit(pair_loops.density_rates, *common, slopes, now.is_wall, now.velocities, now.densities, rates)
         densities = now.densities + time_step * rates
-        if self._renormalize_every and steps % self._renormalize_every == 0:
+        if self._scheme.renormalize_every and steps % self._scheme.renormalize_every == 0:
             evolved = densities.copy()
             rows.visit(pair_loops.shepard_densities, *common, table, now.is_wall, evolved, densities)
         return densities
@@ -351,7 +366,7 @@ def _check_wide_enough(box: Box, reach: float) -> None:
 def _outside(positions: np.ndarray, box: Box) -> np.ndarray:
     """Which positions (N, D or more) lie beyond the bounds of the box (N,)."""
     along = positions[:, : box.dim]
-    return ((along < box.lower) | (along > box.upper)).any(axis=1)
+    return np.any((along < box.lower) | (along > box.upper), axis=1)
 
 
 def _check_inside(positions: Tensor, box: Box) -> None:

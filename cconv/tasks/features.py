@@ -150,13 +150,13 @@ class Inputs:
 
     def double(self) -> "Inputs":
         """The same in float64."""
-        walls = {}
-        if self.wall_positions is not None and self.wall_features is not None:
-            walls = {
-                "wall_positions": self.wall_positions.double(),
-                "wall_features": self.wall_features.to(torch.float64),
-            }
-        return replace(self, positions=self.positions.double(), features=self.features.to(torch.float64), **walls)
+        return replace(
+            self,
+            positions=self.positions.double(),
+            features=self.features.to(torch.float64),
+            wall_positions=None if self.wall_positions is None else self.wall_positions.double(),
+            wall_features=None if self.wall_features is None else self.wall_features.to(torch.float64),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,13 +220,13 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
         names: Features of the fluid particles; no sum over neighbours is taken for those that are not named.
     """
     units = units_of(state.masses, scene)
-    corners = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
+    lower, upper = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
     return Inputs(
         positions=(state.positions / units.length).float(),
         features=_fluid_features(state, units, names),
         wall_positions=None if boundary is None else (boundary.positions.double() / units.length).float(),
         wall_features=None if boundary is None else _wall_features(boundary),
-        box=Box(*corners, scene.box.periodic),
+        box=Box(lower, upper, scene.box.periodic),
         units=units,
     )
 

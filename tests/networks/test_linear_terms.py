@@ -4,8 +4,8 @@ import torch
 from cconv.errors import ConfigError
 from cconv.models.closed_form import NormalEquations
 from cconv.neighbors import radius_graph
-from cconv.networks import ConvNet, RadialNet
-from cconv.nn import ConvGeometry, RadialGeometry
+from cconv.networks import Channels, ConvNet, RadialNet, WallInputs
+from cconv.nn import ConvGeometry, Kinds, RadialGeometry
 
 
 def normal(generator, *shape):
@@ -20,16 +20,14 @@ def points(generator):
 
 def grid(points, message):
     geometries = [ConvGeometry(edges, 3) for edges in points]
-    return lambda generator: ConvNet(
-        4, (2,), 3, 2, boundary_channels=2, message=message, generator=generator
-    ).double(), geometries
+    channels = Channels(4, (2,), walls=2)
+    return lambda generator: ConvNet(channels, (3, 3), message=message, generator=generator).double(), geometries
 
 
 def radial(points, message, outputs=(2, 1)):
     geometries = [RadialGeometry(edges, 3, window="poly6") for edges in points]
-    return lambda generator: RadialNet(
-        (2, 1), (outputs,), 3, 2, boundary_channels=(0, 1), message=message, generator=generator
-    ).double(), geometries
+    channels = Channels(Kinds(2, 1), (Kinds(*outputs),), walls=Kinds(0, 1))
+    return lambda generator: RadialNet(channels, 3, 2, message=message, generator=generator).double(), geometries
 
 
 @pytest.mark.parametrize("message", ["absolute", "difference"])
@@ -37,7 +35,7 @@ def radial(points, message, outputs=(2, 1)):
 def test_terms_times_coefficients_are_the_network(make, message, points, generator):
     """Coefficients found from a network's own outputs give back its outputs, what its biases add included."""
     build, (fluid, walls) = make(points, message)
-    inputs = normal(generator, 80, 4), fluid, normal(generator, 30, 2), walls
+    inputs = normal(generator, 80, 4), fluid, WallInputs(normal(generator, 30, 2), walls)
     teacher, student = build(generator), build(generator)
     for name, parameter in teacher.named_parameters():
         if name.endswith("bias"):
@@ -58,7 +56,7 @@ def test_terms_times_coefficients_are_the_network(make, message, points, generat
 def test_scalars_or_vectors_alone(outputs, points, generator):
     build, (fluid, walls) = radial(points, "difference", outputs)
     layer = build(generator).linear_terms()
-    terms = layer.terms(normal(generator, 80, 4), fluid, normal(generator, 30, 2), walls)
+    terms = layer.terms(normal(generator, 80, 4), fluid, WallInputs(normal(generator, 30, 2), walls))
     targets = layer.targets(normal(generator, 80, 1 if outputs[0] else 2))
     assert len(terms) == len(targets) == 1
     assert len(terms[0]) == len(targets[0])
@@ -91,4 +89,4 @@ def test_dependent_terms_need_a_ridge(generator):
 
 def test_several_layers_have_no_closed_form():
     with pytest.raises(ConfigError, match="`network.layers` must be 1"):
-        ConvNet(2, (3, 1), 3, 2).linear_terms()
+        ConvNet(Channels(2, (3, 1)), (3, 3)).linear_terms()

@@ -5,7 +5,7 @@ import torch
 
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
-from cconv.networks import RadialNet
+from cconv.networks import Channels, RadialNet, WallInputs
 from cconv.nn import RadialConv, RadialGeometry
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.sph import CubicSpline, density_gradient, density_rate
@@ -64,15 +64,15 @@ def dense_radial_conv(layer, features, positions, senders_at, features_at_receiv
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_agrees_with_the_sum_over_all_pairs(dim, message, generator):
     positions = torch.rand(30, dim, generator=generator, dtype=torch.float64)
-    layer = RadialConv((2, 3), (3, 2), 5, dim, message=message, generator=generator).double()
-    features = normal(generator, 30, Kinds(*(2, 3)).num_values(dim))
+    layer = RadialConv(Kinds(2, 3), Kinds(3, 2), 5, dim, message=message, generator=generator).double()
+    features = normal(generator, 30, Kinds(2, 3).num_values(dim))
     output = layer(features, RadialGeometry(radius_graph(positions, CUTOFF), 5))
     torch.testing.assert_close(output, dense_radial_conv(layer, features, positions, positions, features))
 
 
 def test_bipartite_agrees_with_the_sum_over_all_pairs(generator):
     points, queries = (torch.rand(count, 2, generator=generator, dtype=torch.float64) for count in (20, 30))
-    layer = RadialConv((1, 1), (2, 1), 4, 2, generator=generator).double()
+    layer = RadialConv(Kinds(1, 1), Kinds(2, 1), 4, 2, generator=generator).double()
     features = normal(generator, 20, 3)
     output = layer(features, RadialGeometry(radius_graph(points, CUTOFF, queries=queries), 4))
     torch.testing.assert_close(output, dense_radial_conv(layer, features, queries, points, None))
@@ -83,20 +83,22 @@ def test_bipartite_agrees_with_the_sum_over_all_pairs(generator):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_network_is_equivariant(dim, message, reflect, generator):
     positions, walls = (torch.rand(count, dim, generator=generator, dtype=torch.float64) for count in (60, 20))
-    network = RadialNet(
-        (2, 1), ((6, 4), (6, 4), (3, 2)), 6, dim, boundary_channels=(0, 1), message=message, generator=generator
-    ).double()
-    features, normals = normal(generator, 60, Kinds(*(2, 1)).num_values(dim)), normal(generator, 20, dim)
+    channels = Channels(Kinds(2, 1), (Kinds(6, 4), Kinds(6, 4), Kinds(3, 2)), walls=Kinds(0, 1))
+    network = RadialNet(channels, 6, dim, message=message, generator=generator).double()
+    features, normals = normal(generator, 60, Kinds(2, 1).num_values(dim)), normal(generator, 20, dim)
     matrix, shift = orthogonal(generator, dim, reflect), normal(generator, dim)
 
     def output(at, values, walls_at, wall_values):
         fluid = RadialGeometry(radius_graph(at, CUTOFF), 6, window="poly6")
         wall = RadialGeometry(radius_graph(walls_at, CUTOFF, queries=at), 6, window="poly6")
-        return network(values, fluid, wall_values, wall)
+        return network(values, fluid, WallInputs(wall_values, wall))
 
-    expected = turned(output(positions, features, walls, normals), (3, 2), matrix)
+    expected = turned(output(positions, features, walls, normals), Kinds(3, 2), matrix)
     found = output(
-        positions @ matrix.T + shift, turned(features, (2, 1), matrix), walls @ matrix.T + shift, normals @ matrix.T
+        positions @ matrix.T + shift,
+        turned(features, Kinds(2, 1), matrix),
+        walls @ matrix.T + shift,
+        normals @ matrix.T,
     )
     assert expected.abs().max() > 0.1
     assert (found - expected).abs().max() < 1e-10
@@ -111,9 +113,9 @@ def test_one_layer_holds_the_density_rate_and_the_density_gradient(generator):
     masses = torch.ones(200, dtype=torch.float64)
     slope = kernel.derivative(torch.linspace(0, CUTOFF, 400, dtype=torch.float64))
     velocities = normal(generator, 200, 3)
-    rate = RadialConv((0, 1), (1, 0), 400, 3, message="difference").double()
+    rate = RadialConv(Kinds(0, 1), Kinds(1, 0), 400, 3, message="difference").double()
     densities = 1 + torch.rand(200, generator=generator, dtype=torch.float64)
-    gradient = RadialConv((1, 0), (0, 1), 400, 3, message="difference").double()
+    gradient = RadialConv(Kinds(1, 0), Kinds(0, 1), 400, 3, message="difference").double()
     with torch.no_grad():
         rate.scalar_filters[:, 0, 0] = slope  # (v_i - v_j) · ∇_i W = (v_j - v_i) · r̂ W', as ∇_i W = -r̂ W'
         gradient.vector_filters[:, 0, 0] = -slope
@@ -130,7 +132,7 @@ def test_one_layer_holds_the_density_rate_and_the_density_gradient(generator):
 def test_gradients(message, generator):
     positions = torch.rand(7, 2, generator=generator, dtype=torch.float64).requires_grad_()
     features = normal(generator, 7, 3).requires_grad_()
-    layer = RadialConv((1, 1), (2, 1), 3, 2, message=message, generator=generator).double()
+    layer = RadialConv(Kinds(1, 1), Kinds(2, 1), 3, 2, message=message, generator=generator).double()
 
     def convolve(at, values, *filters):
         return torch.func.functional_call(
@@ -149,7 +151,7 @@ def test_gradients(message, generator):
 def test_parts_of_a_geometry_keep_the_gradients_it_was_made_with(generator):
     """Whatever the mode in which they are first asked for."""
     positions = torch.rand(12, 2, generator=generator, dtype=torch.float64).requires_grad_()
-    layer = RadialConv((1, 1), (1, 1), 3, 2, generator=generator).double()
+    layer = RadialConv(Kinds(1, 1), Kinds(1, 1), 3, 2, generator=generator).double()
     features = normal(generator, 12, 3)
 
     def gradient(geometry):
@@ -170,7 +172,8 @@ def test_parts_of_a_geometry_keep_the_gradients_it_was_made_with(generator):
 def test_prediction_equals_what_is_differentiated(generator):
     """Two layers of few outputs: without gradients all of it takes another path."""
     positions = torch.rand(80, 3, generator=generator, dtype=torch.float64)
-    network = RadialNet((2, 1), ((4, 4), (1, 0)), 6, 3, message="difference", generator=generator).double()
+    channels = Channels(Kinds(2, 1), (Kinds(4, 4), Kinds(1, 0)))
+    network = RadialNet(channels, 6, 3, message="difference", generator=generator).double()
     features, geometry = normal(generator, 80, 5), RadialGeometry(radius_graph(positions, CUTOFF), 6)
     with torch.no_grad():
         predicted = network(features, geometry)
@@ -179,7 +182,7 @@ def test_prediction_equals_what_is_differentiated(generator):
 
 def test_bias_is_added_to_scalars_alone(generator):
     positions = torch.rand(20, 2, generator=generator, dtype=torch.float64)
-    layer = RadialConv((1, 1), (2, 1), 3, 2, generator=generator).double()
+    layer = RadialConv(Kinds(1, 1), Kinds(2, 1), 3, 2, generator=generator).double()
     features, geometry = normal(generator, 20, 3), RadialGeometry(radius_graph(positions, CUTOFF), 3)
     with torch.no_grad():
         before = layer(features, geometry)
@@ -191,11 +194,12 @@ def test_bias_is_added_to_scalars_alone(generator):
 def test_no_vectors_no_scalars_no_neighbours(generator):
     positions = torch.tensor([[0.0, 0], [5, 5]], dtype=torch.float64)
     geometry = RadialGeometry(radius_graph(positions, CUTOFF), 3)
-    for channels_in, channels_out in itertools.product([(2, 0), (0, 2)], [(1, 0), (0, 1), (2, 2)]):
+    inputs, outputs = [Kinds(2, 0), Kinds(0, 2)], [Kinds(1, 0), Kinds(0, 1), Kinds(2, 2)]
+    for channels_in, channels_out in itertools.product(inputs, outputs):
         layer = RadialConv(channels_in, channels_out, 3, 2, generator=generator).double()
         with torch.no_grad():
             layer.bias.fill_(0.5)
-        output = layer(normal(generator, 2, Kinds(*channels_in).num_values(2)), geometry)
+        output = layer(normal(generator, 2, channels_in.num_values(2)), geometry)
         scalars, vectors = split_kinds(output, channels_out, 2)
         assert (scalars == 0.5).all()
         assert (vectors == 0).all()
@@ -207,7 +211,7 @@ def test_bad_input_is_named(generator):
         RadialGeometry(edges, 0)
     with pytest.raises(ConfigError, match="window"):
         RadialGeometry(edges, 3, window="poly")
-    layer, geometry = RadialConv((1, 1), (1, 1), 3, 2).double(), RadialGeometry(edges, 3)
+    layer, geometry = RadialConv(Kinds(1, 1), Kinds(1, 1), 3, 2).double(), RadialGeometry(edges, 3)
     with pytest.raises(ShapeError, match="`features` must have shape \\(10, 3\\)"):
         layer(normal(generator, 10, 4), geometry)
     with pytest.raises(ShapeError, match="3 terms"):

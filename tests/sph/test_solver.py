@@ -15,7 +15,7 @@ from cconv.sph import KERNELS, QuinticSpline, density, density_rate
 from cconv.sph import neighbor_list as module
 from cconv.sph.kernel_table import kernel_tables
 from cconv.sph.pair_loops import look_up
-from cconv.sph.solver import EquationOfState, WeaklyCompressibleSPH, check_time_step, largest_time_step
+from cconv.sph.solver import EquationOfState, Scheme, WeaklyCompressibleSPH, check_time_step, largest_time_step
 
 SPACING = 0.1
 BOX = Box((0.0, 0.0), (1.0, 1.0), periodic=True)
@@ -27,10 +27,10 @@ def shaken(generator, box=BOX, jitter=0.3, spacing=SPACING):
     return box.wrap(positions + jitter * spacing * (2 * torch.rand(positions.shape, generator=generator).double() - 1))
 
 
-def solver_in(box=BOX, spacing=SPACING, kernel=None, **settings):
+def solver_in(box=BOX, spacing=SPACING, kernel=None, scheme=None, **settings):
     settings.setdefault("equation_of_state", EquationOfState(sound_speed=10.0))
-    kernel = kernel or QuinticSpline(spacing, box.dim)
-    return WeaklyCompressibleSPH(kernel=kernel, box=box, particle_spacing=spacing, **settings)
+    kernel, scheme = kernel or QuinticSpline(spacing, box.dim), scheme or Scheme()
+    return WeaklyCompressibleSPH(kernel=kernel, box=box, particle_spacing=spacing, scheme=scheme, **settings)
 
 
 def state_of(solver, positions, velocities=None, walls=0, viscosity=0.01):
@@ -89,10 +89,8 @@ def mixed(generator, dim, walls, friction=True, density="evolution"):
 
     push = torch.tensor([0.3, -1.0, 0.2][:dim], dtype=torch.float64)
     eos = EquationOfState(rest_density=1.0, sound_speed=7.0, exponent=7.0, background_pressure=0.4)
-    solver = solver_in(
-        box, spacing, equation_of_state=eos, density=density, wall_friction=friction, transport_pressure=13.0,
-        artificial_viscosity=0.2, force=lambda x: push * (1 + x[:, :1]),
-    )  # fmt: skip
+    scheme = Scheme(density=density, wall_friction=friction, transport_pressure=13.0, artificial_viscosity=0.2)
+    solver = solver_in(box, spacing, equation_of_state=eos, scheme=scheme, force=lambda x: push * (1 + x[:, :1]))
     state = solver.initial_state(
         positions,
         uniform(-1, 1, dim),
@@ -131,8 +129,14 @@ def test_a_step_is_that_of_sums_over_all_pairs(dim, walls, friction, generator):
 def test_renormalised_densities_are_those_of_sums_over_all_pairs(generator):
     """Near the surface the sum of volumes is below 1, inside above: both cases of the filter occur."""
     solver, state, _, box = mixed(generator, 2, 0)
-    filtering = solver_in(box, density="evolution", renormalize_every=1, equation_of_state=solver.equation_of_state)
-    plain = solver_in(box, density="evolution", equation_of_state=solver.equation_of_state)
+    filtering, plain = (
+        solver_in(
+            box,
+            equation_of_state=solver.equation_of_state,
+            scheme=Scheme(density="evolution", renormalize_every=steps),
+        )
+        for steps in (1, 0)
+    )
     evolved, found = plain.step(state, 1e-9), filtering.step(state, 1e-9)
     dense = DenseSPH(evolved, QuinticSpline(SPACING, 2), box)
     volumes = (state.masses / evolved.densities * dense.w).sum(dim=1)
@@ -175,7 +179,7 @@ def test_summed_density_is_the_operators(dim, generator):
 
 def test_density_evolves_by_the_rate_of_density(generator):
     # With equal densities m_j/ρ_j ρ_i = m_j: the continuity equation is D2.
-    solver = solver_in(density="evolution")
+    solver = solver_in(scheme=Scheme(density="evolution"))
     positions = shaken(generator)
     velocities = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
     before = state_of(solver, positions, velocities)
@@ -188,7 +192,7 @@ def test_density_evolves_by_the_rate_of_density(generator):
 @pytest.mark.parametrize("density_scheme", ["summation", "evolution"])
 @pytest.mark.parametrize("transport", [0.0, 100.0])
 def test_momentum_is_conserved_without_walls_and_forces(density_scheme, transport, generator):
-    solver = solver_in(density=density_scheme, transport_pressure=transport, artificial_viscosity=0.1)
+    solver = solver_in(scheme=Scheme(density=density_scheme, transport_pressure=transport, artificial_viscosity=0.1))
     positions = shaken(generator)
     velocities = torch.randn(positions.shape, generator=generator, dtype=torch.float64)
     state = state_of(solver, positions, velocities)
@@ -200,7 +204,7 @@ def test_momentum_is_conserved_without_walls_and_forces(density_scheme, transpor
 
 
 def test_a_lattice_at_rest_stays(generator):
-    solver = solver_in(transport_pressure=100.0)
+    solver = solver_in(scheme=Scheme(transport_pressure=100.0))
     start = lattice((10, 10), SPACING, (0.0, 0.0))
     state = state_of(solver, start)
     for _ in range(20):
@@ -213,7 +217,7 @@ def test_transport_velocity_moves_particles_apart_and_their_centre_not(generator
     without = solver_in()
     alone = without.step(state_of(without, positions), 1e-3)
     assert torch.equal(alone.transport_velocities, alone.velocities)
-    solver = solver_in(transport_pressure=100.0)
+    solver = solver_in(scheme=Scheme(transport_pressure=100.0))
     state = solver.step(state_of(solver, positions), 1e-3)
     shifts = state.transport_velocities - state.velocities
     edges = radius_graph(positions, 0.07, BOX)  # close pairs
@@ -258,7 +262,7 @@ def test_rotated_scenes_give_rotated_motion(generator):
     turn = torch.tensor([[math.cos(0.4), -math.sin(0.4)], [-math.sin(0.4), -math.cos(0.4)]], dtype=torch.float64)
 
     def run(positions, velocities):
-        solver = solver_in(box, density="evolution", artificial_viscosity=0.2)
+        solver = solver_in(box, scheme=Scheme(density="evolution", artificial_viscosity=0.2))
         state = state_of(solver, positions, velocities)
         for _ in range(30):
             state = solver.step(state, 1e-3)
@@ -278,7 +282,7 @@ def test_hydrostatic_pressure_holds_the_water_up():
     box = Box((0.0, -0.2), (width * spacing, 1.5), periodic=(True, False))
     gravity = torch.tensor([0.0, -1.0], dtype=torch.float64)
     solver = solver_in(
-        box, spacing, density="evolution", equation_of_state=EquationOfState(sound_speed=sound_speed),
+        box, spacing, scheme=Scheme(density="evolution"), equation_of_state=EquationOfState(sound_speed=sound_speed),
         force=lambda positions: gravity.expand_as(positions),
     )  # fmt: skip
     bottom = walls.positions[walls.positions[:, 1] < 0]
@@ -333,9 +337,9 @@ def test_bad_input_is_refused(generator):
     with pytest.raises(ShapeError, match="velocities"):
         state_of(solver, outside / 2, torch.zeros(3, 2))
     with pytest.raises(ConfigError, match="summation, evolution"):
-        solver_in(density="sumation")
+        Scheme(density="sumation")
     with pytest.raises(ConfigError, match="renormalize_every"):
-        solver_in(renormalize_every=5)
+        Scheme(renormalize_every=5)
     with pytest.raises(ConfigError, match=r"`kernel` must have the dimension of `box` \(2\), got 3"):
         solver_in(kernel=QuinticSpline(SPACING, 3))
     with pytest.raises(ConfigError, match="skin"):
