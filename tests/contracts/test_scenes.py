@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import islice
 
 import pytest
 import torch
@@ -10,7 +11,11 @@ from contracts.registered import registered
 from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
 from cconv.data.hdf5 import write_dataset
+from cconv.data.window import windows
 from cconv.domain import Box
+from cconv.evaluation.rollout_metrics import squared_errors
+from cconv.rollout.integrators import SemiImplicitEuler
+from cconv.rollout.rollout import rollout
 from cconv.scenes import SCENES, scene_named
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.tasks import TASKS, task_named
@@ -91,7 +96,7 @@ def scene(request):
 def dataset(scene, tmp_path_factory):
     """A small data set of the scene."""
     folder = tmp_path_factory.mktemp(scene.name) / "data"
-    generate(scene, folder, num_trajectories=1 if scene.num_trajectories == 1 else 3, num_frames=4, workers=1)
+    generate(scene, folder, num_trajectories=1 if scene.num_trajectories == 1 else 3, num_frames=10, workers=1)
     return open_dataset(folder)
 
 
@@ -148,3 +153,13 @@ def test_a_field_moves_with_the_scene(task, dataset, generator):
         (positions + turns * lengths * periodic, scene.box),
     ):
         torch.testing.assert_close(field(moved, box), expected, **tolerance)
+
+
+@pytest.mark.integration
+def test_a_rollout_of_targets_is_the_stored_trajectory(dataset):
+    """The law of integrators, for walls and lids too, which move as prescribed."""
+    scene, trajectory = dataset.scene, dataset.trajectory("train", 0)
+    euler, (start, *_) = SemiImplicitEuler(), windows(trajectory, 2, len(trajectory) - 2)
+    replayed = islice(rollout(euler.target, euler, start, scene), len(start.future))
+    positions = torch.stack([window.present for window in replayed])
+    assert squared_errors(positions, start.future, scene.box).sqrt().max() < 1e-5 * scene.particle_spacing
