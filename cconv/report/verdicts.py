@@ -38,10 +38,8 @@ class Check:
 
 def verdict_matrix(summary: Mapping) -> list[Check]:
     """One row a check; empty for a run that measured no stability."""
-    measured = [entry["stability"] or {} for entry in summary["finalists"]]
-    first = next((stability for stability in measured if stability), None)
-    if first is None:
-        return []
+    measured = [entry.stability.model_dump() for entry in summary.finalists]
+    first = measured[0]
     limits = first["thresholds"]
     checks = [_overall(measured)]
     for regime, values in first["regimes"].items():
@@ -61,7 +59,7 @@ def verdict_matrix(summary: Mapping) -> list[Check]:
 
 def verdicts_table(summary: Mapping) -> pd.DataFrame:
     """The matrix as a table of texts: one row a check, its limit, then a column for each finalist."""
-    names = [entry["id"] for entry in summary["finalists"]]
+    names = [entry.id for entry in summary.finalists]
     rows = [
         {"check": check.label, "limit": check.limit}
         | {name: cell.text for name, cell in zip(names, check.cells, strict=True)}
@@ -73,10 +71,7 @@ def verdicts_table(summary: Mapping) -> pd.DataFrame:
 def failures_table(summary: Mapping) -> pd.DataFrame:
     """One row a check that a finalist failed, in words."""
     rows = [
-        {"model": entry["id"], "failure": failure}
-        for entry in summary["finalists"]
-        if entry["stability"]
-        for failure in entry["stability"]["failures"]
+        {"model": entry.id, "failure": failure} for entry in summary.finalists for failure in entry.stability.failures
     ]
     return pd.DataFrame(rows, columns=["model", "failure"])
 

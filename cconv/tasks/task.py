@@ -26,6 +26,13 @@ class FieldTask(ABC):
 
     name: ClassVar[str]
     symbol: ClassVar[str]  # of the field, for charts
+    meaning: ClassVar[str]  # of the field, a sentence for readers
+    error: ClassVar[str] = "normalized MSE"
+    error_meaning: ClassVar[str] = (
+        "Mean squared error divided by the variance of the target over the training split: 0 is perfect. Always "
+        "predicting the training mean scores 1 on the training split, more or less on others. Its root is the relative "
+        "RMSE."
+    )
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
     optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without

@@ -26,7 +26,7 @@ def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
         progress=lambda items, label: items,
     )
     checks = _stress(session, [finalist])["baseline"]
-    assert checks["counts"]["seeds"] == 2
-    precise = [line for line in checks["failures"] if "float32" in line]
+    assert checks.counts["seeds"] == 2
+    precise = [line for line in checks.failures if "float32" in line]
     assert len(precise) == 1
     assert "seeds baseline/seed_2 of 2" in precise[0]
