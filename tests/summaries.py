@@ -24,12 +24,14 @@ from cconv.study.records.found import (
 from cconv.study.records.summary import (
     AnalyticCost,
     AttainmentStep,
+    CheckedCounts,
     ComparedModel,
     CostModel,
     Errors,
     ExpectedError,
     FinalistConfig,
     FinalistEntry,
+    Finding,
     Front,
     Growth,
     Hypervolume,
@@ -58,7 +60,7 @@ def minimal_summary(summary: Summary) -> Summary:
     selected = {name: getattr(summary, name) for name in Selected.model_fields}
     models = {entry.id: summary.growth.models[entry.id] for entry in summary.finalists}
     growth = changed(summary.growth, models=models, exponents={})
-    nothing = {"search_points": (), "cost_model": None, "analytic": None, "explained": ()}
+    nothing = {"checks": {}, "search_points": (), "cost_model": None, "analytic": None, "explained": ()}
     return Summary(**selected | nothing | {"growth": growth})
 
 
@@ -68,6 +70,7 @@ def whole_summary(summary: Summary) -> Summary:
     finalists = [changed(entry, stability=stability(entry.test.normalized_mse)) for entry in summary.finalists]
     return changed(
         minimal_summary(summary),
+        checks={name: f"Errors of {name}." for name in ("regimes", "stress", "precision")},
         finalists=finalists,
         search_points=_search_points(),
         cost_model=_cost_model(),
@@ -134,29 +137,18 @@ def finalist(name: str, *, updates: int = 81, fall_at_the_end: float | None = No
 def stability(error: float) -> Stability:
     """Stability of a model that has this error everywhere."""
     failures = [] if error <= 0.05 else [f"error {error:.3g} on the frame clumped (limit 0.05)"]
-    return Stability(
-        **{
-            "regimes": {
-                "bulk": {"normalized_mse": error, "share": 0.9},
-                "near_wall": {"normalized_mse": error, "share": 0.1},
-            },
-            "stress": {"clumped": error, "isolated": None},
-            "still": {"rest": 0.0, "uniform_velocity": 1e-9},
-            "precision": 1e-6,
-            "density_rollout": {"frames": 60, "drift": 1e-3, "largest": 1e-3, "first_frame_outside": None}
-            | {"analytic_by_frames": 0.12},
-            "stable": not failures,
-            "failures": failures,
-            "thresholds": {
-                "stressed_error": 0.05,
-                "regime_error": 0.5,
-                "still": 0.01,
-                "precision": 1e-3,
-                "density": 0.02,
-            },
-            "counts": {"seeds": 3, "plain_frames": 20, "stressed_frames": 3},
-        }
-    )
+    findings = [
+        _finding("regimes", "bulk", error, 0.5, "90 % of particles"),
+        _finding("regimes", "near_wall", error, 0.5, "10 % of particles"),
+        _finding("stress", "clumped", error, 0.05, "trajectory 0, frame 3"),
+        _finding("precision", "float32", 1e-6, 1e-3),
+    ]
+    counts = CheckedCounts(seeds=3, plain_frames=20, stressed_frames=3)
+    return Stability(stable=not failures, findings=findings, failures=failures, counts=counts)
+
+
+def _finding(check: str, label: str, value: float, limit: float, detail: str = "") -> Finding:
+    return Finding(check=check, label=label, value=value, limit=limit, detail=detail)
 
 
 def importances() -> list[RungImportance]:

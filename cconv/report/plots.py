@@ -151,16 +151,14 @@ def cost_chart(summary: Summary) -> Figure:
 
 
 def stability_chart(summary: Summary) -> Figure:
-    """Each check of stability by its limit, log axis: left of the line at 1 a finalist passes."""
-    checks = [check for check in verdict_matrix(summary) if check.limit is not None]
-    names = [entry.id for entry in summary.finalists]
-    figure, axes = new_figure(9, 1.6 + 0.3 * len(checks))
-    for number, name in enumerate(names):
-        places = [place for place, check in enumerate(checks) if check.cells[number].value is not None]
-        ratios = [checks[place].cells[number].value / checks[place].limit for place in places]
-        axes.plot(ratios, places, "o", alpha=0.8, label=name)
+    """Each finding of the checks of stability by its limit, log axis: left of the line at 1 a finalist passes."""
+    rows = verdict_matrix(summary)
+    places = range(len(rows))
+    figure, axes = new_figure(9, 1.6 + 0.3 * len(rows))
+    for number, entry in enumerate(summary.finalists):
+        axes.plot([row.cells[number].value / row.limit for row in rows], places, "o", alpha=0.8, label=entry.id)
     axes.axvline(1, color=MARKED["baseline"], lw=1.2)
-    axes.set_yticks(range(len(checks)), [check.label for check in checks])
+    axes.set_yticks(places, [f"{row.check}: {row.label}" for row in rows])
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="measured by limit", title="checks of stability")
     _legend(axes)

@@ -19,6 +19,7 @@ class DensityGradient(FieldTask):
         "(SPH)."
     )
     output = Kinds(0, 1)
+    checks = ("regimes", "stress", "precision")
 
     def field(self, state: FluidState) -> Tensor:
         """Gradients of density (N, D)."""
@@ -27,6 +28,10 @@ class DensityGradient(FieldTask):
     def unit(self, units: Units) -> float:
         """Rest density a particle spacing."""
         return units.density / units.length
+
+    def magnitude(self, density: float, speed: float, length: float) -> float:
+        """The density by the length, at any speed."""
+        return density / length
 
     def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
         """Gradients of density (N, D) by compiled sums; the densities are summed first, as a user has to."""

@@ -19,6 +19,7 @@ class DensityRate(FieldTask):
         "hydrodynamics (SPH)."
     )
     output = Kinds(1, 0)
+    checks = ("regimes", "stress", "still", "precision", "density")
 
     def field(self, state: FluidState) -> Tensor:
         """Rates of density (N, 1)."""
@@ -27,6 +28,10 @@ class DensityRate(FieldTask):
     def unit(self, units: Units) -> float:
         """Rest density a frame's time."""
         return units.density / units.time
+
+    def magnitude(self, density: float, speed: float, length: float) -> float:
+        """The density in the time that the flow takes for the length."""
+        return density * speed / length
 
     def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
         """Rates of density (N,) by compiled sums."""

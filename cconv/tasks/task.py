@@ -36,6 +36,7 @@ class FieldTask(ABC):
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
     optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without
+    checks: ClassVar[tuple[str, ...]]  # of stability, that models must pass: names in `cconv.evaluation.checks`
 
     kernel: str = "cubic_spline"
     relative_smoothing_length: float = 1.0
@@ -47,6 +48,10 @@ class FieldTask(ABC):
     @abstractmethod
     def unit(self, units: Units) -> float:
         """What networks predict multiples of, in the units of the data."""
+
+    @abstractmethod
+    def magnitude(self, density: float, speed: float, length: float) -> float:
+        """Size of the field where the density differs by so much over a length, in a flow of some speed."""
 
     @abstractmethod
     def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:

@@ -2,15 +2,12 @@
 
 import math
 from dataclasses import replace
-from importlib import import_module
-from inspect import isabstract
-from pathlib import Path
 
 import pytest
 import torch
+from contracts.registered import registered
 from systems import model_of, periodic_frame, periodic_scene, with_walls
 
-import cconv
 from cconv.data.trajectory import Boundary
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.model import build_model
@@ -21,22 +18,13 @@ from cconv.tasks import TASKS, task_named
 from cconv.tasks.samples import make_sample
 from cconv.tasks.task import FieldTask
 
-PACKAGE = Path(cconv.__file__).parent
 CENTER = torch.tensor([0.5, 0.5])
 pairs = pytest.mark.parametrize(("task", "architecture"), [(task, name) for task in TASKS for name in ARCHITECTURES])
 
 
-def registered(folder, base):
-    """Concrete classes of a folder's modules that are of a kind."""
-    for path in sorted((PACKAGE / folder).glob("*.py")):
-        module = import_module(f"cconv.{folder}.{path.stem}")
-        classes = [value for value in vars(module).values() if isinstance(value, type) and issubclass(value, base)]
-        yield from (each for each in classes if each.__module__ == module.__name__ and not isabstract(each))
-
-
 def test_every_task_and_network_of_the_folders_is_in_its_list():
-    assert set(registered("tasks", FieldTask)) == set(TASKS.values())
-    assert set(registered("networks", NetworkSettings)) == set(ARCHITECTURES.values())
+    assert registered("tasks", FieldTask) == set(TASKS.values())
+    assert registered("networks", NetworkSettings) == set(ARCHITECTURES.values())
     assert all(task.name == name for name, task in TASKS.items())
 
 

@@ -38,18 +38,20 @@ class Elements(HTMLParser):
 def hostile(summary):
     """A summary whose free texts, and hyperparameters that are texts, are all hostile; names cannot be."""
     hidden = {"window": HOSTILE, HOSTILE: 1}
+    findings = [changed(each, label=HOSTILE, detail=HOSTILE) for each in summary.chosen.stability.findings]
     comparisons = [changed(row, why_not=HOSTILE) for row in summary.selection.comparisons]
     finalists = [
         changed(
             entry,
             config=changed(entry.config, parameters=entry.config.parameters | hidden),
-            stability=changed(entry.stability, failures=[HOSTILE]),
+            stability=changed(entry.stability, failures=[HOSTILE], findings=findings),
         )
         for entry in summary.finalists
     ]
     task = dict.fromkeys(("symbol", "meaning", "error", "error_meaning"), HOSTILE)
     return changed(
         summary,
+        checks=dict.fromkeys(summary.checks, HOSTILE),
         task=changed(summary.task, **task),
         recommended=changed(summary.recommended, reason=f"{HOSTILE}. {HOSTILE}"),
         refined={HOSTILE: HOSTILE},

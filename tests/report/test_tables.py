@@ -18,7 +18,7 @@ from cconv.report.tables import (
     strategies_table,
     trials_table,
 )
-from cconv.report.verdicts import failures_table, verdict_matrix, verdicts_table
+from cconv.report.verdicts import ALL, checks_table, failures_table, verdict_matrix, verdicts_table
 from cconv.study.records.run_folder import RunFolder
 
 
@@ -109,19 +109,20 @@ def test_importances_have_a_row_a_rung_and_hyperparameter_where_they_are_known(s
 
 
 def test_verdicts_agree_with_the_limits(summary):
-    checks = {check.label: check for check in verdict_matrix(summary)}
+    rows = {(row.check, row.label): row for row in verdict_matrix(summary)}
     errors = [entry.test.normalized_mse for entry in summary.finalists]
-    assert [cell.passes for cell in checks["frame clumped"].cells] == [error <= 0.05 for error in errors]
-    assert [cell.passes for cell in checks["passes every check"].cells] == [error <= 0.05 for error in errors]
-    assert {cell.text for cell in checks["frame isolated"].cells} == {"–"}
-    assert checks["regime bulk (90 % of the particles)"].limit == 0.5
+    assert [cell.passes for cell in rows["stress", "clumped"].cells] == [error <= 0.05 for error in errors]
+    assert rows["regimes", "near wall"].limit == 0.5
+    assert {cell.detail for cell in rows["regimes", "near wall"].cells} == {"10 % of particles"}
 
 
 def test_tables_of_verdicts_say_the_same_as_the_matrix(summary):
-    table = verdicts_table(summary).set_index("check")
-    for check in verdict_matrix(summary):
-        assert list(table.loc[check.label].iloc[1:]) == [cell.text for cell in check.cells]
+    table = verdicts_table(summary).set_index(["check", "label"])
+    for row in verdict_matrix(summary):
+        assert list(table.loc[(row.check, row.label)].iloc[1:]) == [f"{cell.value:.3g}" for cell in row.cells]
+    assert set(checks_table(summary)["check"]) == set(table.index.get_level_values("check")) - {ALL}
     failed = [entry.id for entry in summary.finalists if not entry.stability.stable]
+    assert [name for name in table.columns[1:] if table.loc[(ALL, "passes"), name] == "no"] == failed
     assert list(failures_table(summary)["model"]) == failed
 
 

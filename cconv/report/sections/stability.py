@@ -1,5 +1,6 @@
-"""Where the models fail: every check of every finalist."""
+"""Where the models fail: what every check of stability found in every finalist."""
 
+from itertools import groupby
 from typing import Any
 
 from cconv.report.sections.section import Records, Section
@@ -8,12 +9,13 @@ from cconv.study.records.summary import Summary
 
 
 class StabilitySection(Section):
-    """Checks of the finalists, each with its limit."""
+    """Findings of the checks in all finalists, each with its limit."""
 
     name = "stability"
     title = "Stability"
-    part = "finalists"
+    part = "checks"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """A row a check."""
-        return {"stability": verdict_matrix(summary)}
+        """The rows of each check, by its name."""
+        rows = groupby(verdict_matrix(summary), key=lambda row: row.check)
+        return {"rows_of": {check: list(found) for check, found in rows}}

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from cconv.study.records.forms import Count, NonNegative
 from cconv.study.records.found import Interval, Parts
-from cconv.validation import Flag, Id, Name, OpenModel, PathText, Real, StrictModel, Value
+from cconv.validation import Flag, Id, Name, PathText, Real, StrictModel, Value
 
 
 class TaskFacts(StrictModel):
@@ -141,11 +141,51 @@ class FinalistConfig(StrictModel):
     parameters: dict[str, Value]
 
 
-class Stability(OpenModel):
-    """Checks of stability."""
+class Finding(StrictModel):
+    """What a check of stability measured in the worst seed of a finalist.
+
+    Attributes:
+        check: Name of the check.
+        label: What was looked at.
+        value: What was measured.
+        limit: What it must not exceed.
+        detail: What else a reader needs.
+    """
+
+    check: Name
+    label: str
+    value: Real
+    limit: Real
+    detail: str
+
+    @property
+    def passes(self) -> bool:
+        """Whether the limit is kept."""
+        return self.value <= self.limit
+
+
+class CheckedCounts(StrictModel):
+    """How many seeds were checked, on how many frames as they are, and on how many in every other state."""
+
+    seeds: Count
+    plain_frames: Count
+    stressed_frames: Count
+
+
+class Stability(StrictModel):
+    """Whether a finalist passes every check of stability.
+
+    Attributes:
+        stable: Whether all seeds keep every limit.
+        findings: What the checks measured; their checks and labels are the same for all finalists.
+        failures: A line for each finding beyond its limit.
+        counts: What was looked at.
+    """
 
     stable: Flag
+    findings: tuple[Finding, ...]
     failures: tuple[str, ...]
+    counts: CheckedCounts
 
 
 class FinalistEntry(StrictModel):
@@ -319,6 +359,7 @@ class Selected(StrictModel):
         task: Its task.
         dataset: Its data.
         baseline: Id of the published network among the finalists.
+        checks: What each check of stability looks at, by name; empty for a task without checks.
         mean_predictor: Error of predicting the mean.
         finalists: The finalists that were compared.
         budget: What the budget decided, in words; "" where it decided nothing.
@@ -341,6 +382,7 @@ class Selected(StrictModel):
     task: TaskFacts
     dataset: DatasetFacts
     baseline: Name
+    checks: dict[Name, str]
     mean_predictor: MeanPredictor
     finalists: tuple[FinalistEntry, ...] = Field(min_length=1)
     budget: str

@@ -11,10 +11,12 @@ from typing import Literal
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
+from cconv.evaluation.checks import make_checks
+from cconv.evaluation.checks.material import make_material
+from cconv.evaluation.checks.predictor import ModelPredictor
+from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
-from cconv.evaluation.probes import make_probes
-from cconv.evaluation.stability import ModelPredictor, measure_stability
 from cconv.models.checkpoint import load_model
 from cconv.models.errors import mean_predictor_error, normalized_mse
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
@@ -99,6 +101,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
         task=_task(session),
         dataset=_dataset(session, samples),
         baseline=BASELINE,
+        checks=judged.checks,
         mean_predictor=mean,
         finalists=entries,
         budget=budget_words(entries, earlier.convergence, study.selection.margin),
@@ -135,7 +138,8 @@ class _Judged:
         costs: Cost of each, and of some trials.
         analytic: Cost of the analytic field, timed in turn with them.
         times: Time of each.
-        stability: Checks of each.
+        checks: What each check of stability looks at, by name.
+        stability: What the checks found in each.
         choose: Validation errors of the finalists to a recommendation.
         chosen: The recommendation by all seeds.
     """
@@ -145,6 +149,7 @@ class _Judged:
     costs: dict[str, Cost]
     analytic: AnalyticCost
     times: dict[str, Timing]
+    checks: dict[str, str]
     stability: dict[str, Stability]
     choose: Callable[[Mapping[str, np.ndarray]], Recommendation]
     chosen: Recommendation
@@ -153,12 +158,12 @@ class _Judged:
 def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
     settings = session.study.selection
     facts, errors = _errors(session, finalists, session.problem.valid_samples, "validation errors")
-    (costs, analytic), stability = _time(session, finalists), _stress(session, finalists)
+    (costs, analytic), (checks, stability) = _time(session, finalists), _stress(session, finalists)
     times = {name: Timing(costs[name].turns_ms) for name in facts}
     choose = partial(
         recommend,
         times=times,
-        failures={name: checks.failures for name, checks in stability.items()},
+        failures={name: found.failures for name, found in stability.items()},
         accurate_enough=settings.accurate_enough,
         margin=settings.margin,
     )
@@ -168,6 +173,7 @@ def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
         costs=costs,
         analytic=analytic,
         times=times,
+        checks=checks,
         stability=stability,
         choose=choose,
         chosen=choose(errors),
@@ -245,24 +251,27 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
     )
 
 
-def _stress(session: Session, finalists: Sequence[Retrained]) -> dict[str, Stability]:
-    """Stability of every seed on validation trajectories; the test split is only looked at for its errors."""
+def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, str], dict[str, Stability]]:
+    """What each check of stability looks at, and what they found in every seed, all on validation trajectories.
+
+    The test split is only looked at for its errors.
+    """
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    probes = make_probes(trajectories, scene, problem.task, reach)
-    return {
-        finalist.id: Stability(
-            **measure_stability(
-                {
-                    record.id: ModelPredictor(load_model(checkpoint))
-                    for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True)
-                },
-                probes,
-            )
-        )
+    material = make_material(trajectories, scene, problem.task, reach)
+    checks = make_checks(material)
+    found = {
+        finalist.id: Stability(**measure_stability(_predictors(finalist), checks, material))
         for finalist in session.progress(finalists, "stability")
     }
+    return {check.name: check.description() for check in checks}, found
+
+
+def _predictors(finalist: Retrained) -> dict[str, ModelPredictor]:
+    """Every training of a finalist as a predictor, by its name."""
+    trained = zip(finalist.records, finalist.checkpoints, strict=True)
+    return {record.id: ModelPredictor(load_model(checkpoint)) for record, checkpoint in trained}
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:

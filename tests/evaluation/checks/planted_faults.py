@@ -73,6 +73,27 @@ class Spoiled(Analytic):
         return self.fault(super().field(state, frame, scene), state, frame, scene, self.usual, self)
 
 
+def spoiled(material, fault):
+    """The analytic field of a task with a fault (field, state, frame, scene, usual, predictor to the spoiled field)."""
+    kernel = material.task.kernel_at(material.scene.particle_spacing, material.scene.dim)
+    return Spoiled(task=material.task.name, kernel=kernel, usual=usual_of(material), fault=fault)
+
+
+def usual_of(material):
+    """What is usual in the frames of the checks."""
+    spacing = material.scene.particle_spacing
+    counts = [
+        radius_graph(probe.frame.positions.double(), 2 * spacing, probe.scene.box).row_splits.diff().double()
+        for probe in material.plain
+    ]
+    return Usual(
+        spacing=spacing,
+        neighbors=float(torch.cat(counts).median()),
+        fastest=material.fastest,
+        rate=material.typical**0.5,
+    )
+
+
 def neighbors(state, scene, usual):
     return radius_graph(state.positions.double(), 2 * usual.spacing, scene.box).row_splits.diff()
 
@@ -203,44 +224,58 @@ def flips_when_tilted(field, state, frame, scene, usual, model):
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, the words of the finding that must name it, and where it can be planted."""
+    """A fault, the check and the words in the label of the finding that must name it, and where it can be planted."""
 
     spoil: Callable
-    named: str
+    check: str
+    label: str
     tasks: tuple[str, ...] = ("density_rate", "density_gradient")
     needs_walls: bool = False
     needs_periodic: bool = False
     needs_open: bool = False
     in_3d: bool = False
 
+    @property
+    def places(self):
+        """Flows in which it can be planted: in 2D, also in 3D where the finding depends on the dimension."""
+        periodic = self.needs_periodic or not (self.needs_walls or self.needs_open)
+        dims = (2, 3) if self.in_3d else (2,)
+        return [{"dim": dim, "walls": self.needs_walls, "periodic": periodic} for dim in dims]
+
 
 RATE = ("density_rate",)
 FAULTS = {
-    "sign flipped for pairs closer than 0.2 spacings": Fault(close_pairs_times(-1.0), "clumped", RATE, in_3d=True),
-    "zero for pairs closer than 0.2 spacings": Fault(close_pairs_times(0.0), "clumped", RATE),
-    "three times the truth for pairs closer than 0.2 spacings": Fault(close_pairs_times(3.0), "clumped", RATE),
-    "explosion beyond 20 times the largest speed": Fault(explodes_beyond_20_times_the_speed, "hundred_times_as_fast"),
-    "sign flipped where neighbours are a third more than usual": Fault(
-        flips_where_crowded, "forty_percent_denser", in_3d=True
+    "sign flipped for pairs closer than 0.2 spacings": Fault(
+        close_pairs_times(-1.0), "stress", "clumped", RATE, in_3d=True
     ),
-    "no number for isolated particles": Fault(nan_when_alone, "isolated"),
-    "a constant for isolated particles": Fault(constant_when_alone, "isolated"),
-    "wrong near walls": Fault(flips_near_walls, "near_wall", needs_walls=True),
-    "zero at the free surface": Fault(zero_at_the_surface, "free_surface", needs_open=True),
-    "wrong when turned": Fault(flips_when_turned, "turned", in_3d=True),
-    "wrong when tilted": Fault(flips_when_tilted, "tilted", needs_walls=True),
-    "wrong when mirrored": Fault(flips_when_mirrored, "mirrored"),
-    "wrong at half density": Fault(flips_at_half_density, "half_density", in_3d=True),
-    "wrong for stretched lattices": Fault(wrong_for_stretched_lattices, "stretched"),
-    "dependence on the place": Fault(depends_on_the_place, "far_away"),
-    "dependence on the frame of reference": Fault(depends_on_the_frame_of_reference, "moving_frame"),
-    "rate of a translation": Fault(rate_of_a_translation, "uniform_velocity", RATE),
-    "rate at rest": Fault(rate_at_rest, "rest", RATE),
-    "a bias that drifts": Fault(drifts, "integrated density", RATE),
-    "cancellation in float32": Fault(cancels_in_float32, "float32"),
-    "wrong for the fastest one in a hundred": Fault(flips_the_fastest_percent, "fastest_percent"),
-    "wrong in compressed clumps": Fault(wrong_in_compressed_clumps, "squeezed"),
-    "periodic axes ignored": Fault(ignores_periodic_axes, "periodic_face", needs_periodic=True),
-    "saturation": Fault(saturates, "ten_times_as_fast", RATE),
-    "reversed flow taken as it was": Fault(even_in_the_velocities, "reversed", RATE),
+    "zero for pairs closer than 0.2 spacings": Fault(close_pairs_times(0.0), "stress", "clumped", RATE),
+    "three times the truth for pairs closer than 0.2 spacings": Fault(
+        close_pairs_times(3.0), "stress", "clumped", RATE
+    ),
+    "explosion beyond 20 times the largest speed": Fault(
+        explodes_beyond_20_times_the_speed, "stress", "hundred_times_as_fast"
+    ),
+    "sign flipped where neighbours are a third more than usual": Fault(
+        flips_where_crowded, "stress", "forty_percent_denser", in_3d=True
+    ),
+    "no number for isolated particles": Fault(nan_when_alone, "stress", "isolated"),
+    "a constant for isolated particles": Fault(constant_when_alone, "stress", "isolated"),
+    "wrong near walls": Fault(flips_near_walls, "regimes", "near_wall", needs_walls=True),
+    "zero at the free surface": Fault(zero_at_the_surface, "regimes", "free_surface", needs_open=True),
+    "wrong when turned": Fault(flips_when_turned, "stress", "turned", in_3d=True),
+    "wrong when tilted": Fault(flips_when_tilted, "stress", "tilted", needs_walls=True),
+    "wrong when mirrored": Fault(flips_when_mirrored, "stress", "mirrored"),
+    "wrong at half density": Fault(flips_at_half_density, "stress", "half_density", in_3d=True),
+    "wrong for stretched lattices": Fault(wrong_for_stretched_lattices, "stress", "stretched"),
+    "dependence on the place": Fault(depends_on_the_place, "stress", "far_away"),
+    "dependence on the frame of reference": Fault(depends_on_the_frame_of_reference, "stress", "moving_frame"),
+    "rate of a translation": Fault(rate_of_a_translation, "still", "uniform_velocity", RATE),
+    "rate at rest": Fault(rate_at_rest, "still", "rest", RATE),
+    "a bias that drifts": Fault(drifts, "density", "integrated density", RATE),
+    "cancellation in float32": Fault(cancels_in_float32, "precision", "float32"),
+    "wrong for the fastest one in a hundred": Fault(flips_the_fastest_percent, "regimes", "fastest_percent"),
+    "wrong in compressed clumps": Fault(wrong_in_compressed_clumps, "stress", "squeezed"),
+    "periodic axes ignored": Fault(ignores_periodic_axes, "regimes", "periodic_face", needs_periodic=True),
+    "saturation": Fault(saturates, "stress", "ten_times_as_fast", RATE),
+    "reversed flow taken as it was": Fault(even_in_the_velocities, "stress", "reversed", RATE),
 }

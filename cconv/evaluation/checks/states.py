@@ -13,6 +13,7 @@ from cconv.domain import Box
 from cconv.neighbors import Edges, radius_graph
 from cconv.sph.kernels import AbstractKernel
 
+AS_IT_IS, FAR_AWAY = "as_it_is", "far_away"
 CLUMPED_AT = (0.05, 0.1, 0.15, 0.19)  # distances of clumped pairs, particle spacings
 APPROACH = 3.0  # what a clumped pair adds to the rate of density, in typical rates
 FAR = 1000.0  # particle spacings that a frame is moved by
@@ -67,7 +68,7 @@ def stressed_states(
     fastest = float(frame.velocities.double().norm(dim=1).max()) if fastest is None else fastest
     reach = kernel.support_radius if reach is None else reach
     states = [
-        State(name="as_it_is", frame=frame, scene=scene),
+        State(name=AS_IT_IS, frame=frame, scene=scene),
         _clumped(frame, scene, kernel, typical_rate, generator),
         _squeezed(frame, scene, generator),
         _isolated(frame, scene, generator),
@@ -81,20 +82,7 @@ def stressed_states(
     return [state for state in states if _can_be_searched(state.scene.box, reach)]
 
 
-def still_states(frame: Frame, scene: Scene, fastest: float) -> list[State]:
-    """The frame at rest, and in uniform motion at ten times the speed `fastest`: its density does not change."""
-    at_rest = torch.zeros_like(frame.velocities)
-    return [
-        State(name="rest", frame=replace(frame, velocities=at_rest), scene=scene),
-        State(
-            name="uniform_velocity",
-            frame=replace(frame, velocities=at_rest + 10 * fastest * _direction(scene.dim).to(at_rest.dtype)),
-            scene=scene,
-        ),
-    ]
-
-
-def _direction(dim: int) -> Tensor:
+def oblique(dim: int) -> Tensor:
     """A unit vector along no axis."""
     direction = torch.arange(1, dim + 1, dtype=torch.float64)
     return direction / direction.norm()
@@ -147,7 +135,7 @@ def _faster_states(frame: Frame, scene: Scene, fastest: float) -> Iterator[State
 
 def _in_a_moving_frame(frame: Frame, scene: Scene, fastest: float) -> State:
     """All velocities seen by somebody who passes at ten times the largest speed."""
-    passing = (10 * fastest * _direction(scene.dim)).to(frame.velocities.dtype)
+    passing = (10 * fastest * oblique(scene.dim)).to(frame.velocities.dtype)
     return State(name="moving_frame", frame=replace(frame, velocities=frame.velocities + passing), scene=scene)
 
 
@@ -159,7 +147,7 @@ def _far_away(frame: Frame, scene: Scene) -> State:
     if boundary is not None:
         boundary = replace(boundary, positions=boundary.positions + shift)
     moved = replace(frame, positions=frame.positions + shift, boundary=boundary)
-    return State(name="far_away", frame=moved, scene=replace(scene, box=box))
+    return State(name=FAR_AWAY, frame=moved, scene=replace(scene, box=box))
 
 
 def _moved(name: str, frame: Frame, scene: Scene, matrix: Tensor, of_vectors: Tensor) -> State:

@@ -2,13 +2,23 @@
 
 import itertools
 import math
+from functools import lru_cache
 
 import torch
 
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory
 from cconv.domain import Box
+from cconv.evaluation.checks.material import make_material
+from cconv.tasks import task_named
 
 SPACING = 0.1
+
+
+@lru_cache
+def flow_material(task: str, *, dim: int, walls: bool, periodic: bool):
+    """What checks of a task are made of in a flow."""
+    trajectory, scene = flow(dim, walls=walls, periodic=periodic, frames=7 if dim == 2 else 3)
+    return make_material([trajectory], scene, task_named(task))
 
 
 def velocities_at(positions: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,22 @@
+"""Checks of stability: where models fail that are accurate on average, one file a check.
+
+A model may fail at the free surface, where particles clump (tensile instability), or where a scene is denser or faster
+than the training data. A task names the checks that its models must pass.
+"""
+
+from cconv.evaluation.checks.check import Check
+from cconv.evaluation.checks.density import IntegratedDensity
+from cconv.evaluation.checks.material import Material
+from cconv.evaluation.checks.precision import Precision
+from cconv.evaluation.checks.regimes import Regimes
+from cconv.evaluation.checks.still import StillStates
+from cconv.evaluation.checks.stress import StressedStates
+
+CHECKS: dict[str, type[Check]] = {
+    check.name: check for check in (Regimes, StressedStates, StillStates, Precision, IntegratedDensity)
+}
+
+
+def make_checks(material: Material) -> list[Check]:
+    """Every check that the task names, made once for all models."""
+    return [CHECKS[name](material) for name in material.task.checks]

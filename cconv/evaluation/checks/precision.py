@@ -1,0 +1,33 @@
+"""How far predictions in float32 are from those in float64."""
+
+import math
+
+from cconv.evaluation.checks.check import Check, Finding, worst_of_each_label
+from cconv.evaluation.checks.material import Probe
+from cconv.evaluation.checks.predictor import Predictor
+from cconv.evaluation.checks.states import AS_IT_IS, FAR_AWAY
+
+
+class Precision(Check):
+    """Largest difference between predictions in float32 and in float64, by the root of the target's variance."""
+
+    name = "precision"
+    sentence = (
+        "Largest difference between predictions in single and in double precision, on frames as they are and a "
+        "thousand particle spacings away, by the root of the target's variance."
+    )
+    failure = "{label} is {value:.3g} from float64 (limit {limit:g}); {detail}"
+    limit = 1e-3
+
+    def findings(self, predictor: Predictor) -> list[Finding]:
+        """One finding, of the state and frame with the largest difference."""
+        return worst_of_each_label(
+            self._finding("float32", self._difference(predictor, probe), f"{probe.name}, {probe.origin}")
+            for probe in self.material.stressed
+            if probe.name in (AS_IT_IS, FAR_AWAY)
+        )
+
+    def _difference(self, predictor: Predictor, probe: Probe) -> float:
+        exact = predictor.predict_exactly(probe.frame, probe.scene).double()
+        difference = (predictor.predict(probe.frame, probe.scene).double() - exact).abs().max()
+        return float(difference / math.sqrt(self.material.typical))

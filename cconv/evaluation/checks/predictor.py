@@ -1,0 +1,38 @@
+"""What is checked: a trained model, or anything else that predicts the field of a frame."""
+
+from copy import deepcopy
+from typing import Protocol
+
+from torch import Tensor
+
+from cconv.data.trajectory import Frame, Scene
+from cconv.models.model import Model
+
+
+class Predictor(Protocol):
+    """Something that predicts the field of a frame."""
+
+    def predict(self, frame: Frame, scene: Scene) -> Tensor:
+        """Field (N, C) at the fluid particles, as it is used."""
+
+    def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
+        """The same in float64."""
+
+
+class ModelPredictor:
+    """A trained model as a `Predictor`.
+
+    Args:
+        model: The model.
+    """
+
+    def __init__(self, model: Model):
+        self._model, self._exact = model, deepcopy(model).double()
+
+    def predict(self, frame: Frame, scene: Scene) -> Tensor:
+        """Field (N, C) in the units of the data, as `Model.predict_frame`."""
+        return self._model.predict_frame(frame, scene)
+
+    def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
+        """The same with weights and inputs in float64."""
+        return self._exact.predict(self._model.inputs(frame, scene).double())

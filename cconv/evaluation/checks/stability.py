@@ -1,0 +1,50 @@
+"""Whether a model is stable: what every check finds in all its seeds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from cconv.evaluation.checks.check import Check, Finding
+from cconv.evaluation.checks.material import Material
+from cconv.evaluation.checks.predictor import Predictor
+
+
+def measure_stability(seeds: Mapping[str, Predictor], checks: Sequence[Check], material: Material) -> dict:
+    """All checks of a model's seeds, as they stand in summary.json.
+
+    Args:
+        seeds: Each training of the model, by name.
+        checks: What must hold.
+        material: What the checks were made of.
+
+    Returns:
+        "stable", whether all seeds keep every limit; "findings", those of the worst seed for each check and label;
+        "failures", one line for each that is beyond its limit, with the seeds if there are several; "counts" of seeds
+        and of frames that were looked at.
+    """
+    findings, failures = [], []
+    for check in checks:
+        found = {name: check.findings(predictor) for name, predictor in seeds.items()}
+        worst = [max(same, key=lambda each: each.value) for same in zip(*found.values(), strict=True)]
+        findings += [asdict(finding) for finding in worst]
+        failures += _failures(check, found, worst)
+    return {
+        "stable": not failures,
+        "findings": findings,
+        "failures": failures,
+        "counts": {
+            "seeds": len(seeds),
+            "plain_frames": len(material.plain),
+            "stressed_frames": len(material.few),
+        },
+    }
+
+
+def _failures(check: Check, found: Mapping[str, Sequence[Finding]], worst: Sequence[Finding]) -> list[str]:
+    """A line for each finding beyond its limit, with the seeds that it is of."""
+    lines = []
+    for place, finding in enumerate(worst):
+        if not finding.passes:
+            seeds = [name for name, findings in found.items() if not findings[place].passes]
+            where = f"; seeds {', '.join(seeds)} of {len(found)}" if len(found) > 1 else ""
+            lines.append(f"{check.in_words(finding)}{where}")
+    return lines
