@@ -205,7 +205,7 @@ def as_records(sample: Sample, space: SearchSpace) -> list[TrialRecord]:
             stage="random",
             parameters=row,
             config={},
-            log=[{"updates": sample.updates, "valid_normalized_mse": float(error)}],
+            log=[{"updates": sample.updates, "valid_error": float(error)}],
             outcome="completed",
             reason="",
         )

@@ -270,7 +270,7 @@ def _search_points() -> list[SearchPoint]:
         SearchPoint(
             id=f"{stage}_{number:04d}",
             stage=stage,
-            valid_normalized_mse=10.0 ** (number - 3),
+            valid_error=10.0 ** (number - 3),
             ms_per_frame=2.0 + number,
             measured=stage == "closed_form",
             num_parameters=100 * number + 7,
@@ -330,7 +330,7 @@ def _step(change: str, error: float | None, **parameters) -> AblationStep:
     return AblationStep(
         change=change,
         parameters=parameters,
-        valid_normalized_mse=error,
+        valid_error=error,
         low=error and error / 2,
         high=error and error * 2,
         flops_per_particle=error and 900.0,
@@ -344,7 +344,7 @@ def _budget(updates: int) -> BudgetPoint:
     return BudgetPoint(
         id=f"baseline_after_{updates}",
         updates=updates,
-        valid_normalized_mse=error,
+        valid_error=error,
         by_seed=by_seed,
         train_seconds=updates / 10,
     )

@@ -98,7 +98,7 @@ def test_a_run_folder_with_hostile_strings_is_shown_or_refused(name, cconv, tmp_
     trial = run.trial("random_0000")
     known = {"stage": "random", "init_seed": 0, "num_parameters": 1, "flops_per_particle": 1.0}
     trial.start(known | {"parameters": {"window": "[/red]", name: 1}})
-    trial.append({"updates": 1, "valid_normalized_mse": 0.5, "seconds": 1.0})
+    trial.append({"updates": 1, "valid_error": 0.5, "seconds": 1.0})
     trial.finish("completed", name)
     status, out, error = cconv("study", "status", tmp_path)
     assert (status, error) == (0, "")

@@ -36,7 +36,7 @@ def test_status_and_report_of_a_finished_run(cconv, own_run):
     facts = json.loads(out)
     assert status == 0
     assert facts["state"] == "finished"
-    assert facts["best"]["valid_normalized_mse"] > 0
+    assert facts["best"]["valid_error"] > 0
     status, out, _ = cconv("study", "status", own_run)
     assert "finished" in out
     status, out, _ = cconv("report", own_run)
@@ -76,7 +76,7 @@ def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
     assert "Best validation error" in out
     status, out, _ = cconv("evaluate", tmp_path / "one" / "checkpoint", "--split", "valid", "--json")
     card = json.loads((tmp_path / "one" / "checkpoint" / "card.json").read_text())
-    assert json.loads(out)["normalized_mse"] == pytest.approx(card["valid_normalized_mse"], rel=1e-6)
+    assert json.loads(out)["normalized_mse"] == pytest.approx(card["valid_error"], rel=1e-6)
 
 
 def test_a_training_that_diverges_says_so(cconv, flow_folder, tmp_path):

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.integration
 REPOSITORY = SMOKE.parents[1]
 STUDY = SMOKE.read_text()
 SPACE = (REPOSITORY / "search_spaces" / "smoke.toml").read_text()
-ENTRY = {"updates": 6, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
+ENTRY = {"updates": 6, "train_loss": 1.0, "valid_error": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
 
 @st.composite

@@ -67,7 +67,7 @@ class StudyDisplay:
     def on_trial_result(self, trial: str, entry: Mapping) -> None:
         """Update a row."""
         row = self._rows[trial]
-        row.updates, row.error = entry["updates"], entry["valid_normalized_mse"]
+        row.updates, row.error = entry["updates"], entry["valid_error"]
         row.rate = entry["updates"] / max(entry["seconds"], 1e-9)
 
     def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
@@ -142,7 +142,7 @@ class TrainingBar:
 
     def on_update(self, state) -> None:
         """Show a `TrainingState`."""
-        valid = state.valid_normalized_mse
+        valid = state.valid_error
         if valid is not None:
             self._best = valid if self._best is None else min(self._best, valid)
         rate = state.updates / state.seconds

@@ -52,7 +52,7 @@ def train(
         errors.print(f"Diverged at update {entries[-1]['updates']}: a loss is not finite; lower the learning rate.")
         raise typer.Exit(1)
     folder.finish("completed")
-    best = min(entry["valid_normalized_mse"] for entry in entries)
+    best = min(entry["valid_error"] for entry in entries)
     results.print(f"Best validation error {best:.4g} (normalized MSE). Checkpoint: {folder.checkpoint}", soft_wrap=True)
 
 
@@ -89,7 +89,7 @@ def fit(
         "ridge": ridge,
         "data_seed": config.seeds.data,
         "num_parameters": model.num_parameters,
-        "valid_normalized_mse": error,
+        "valid_error": error,
     }
     save_model(model, out, card | provenance(config, dataset))
     results.print(

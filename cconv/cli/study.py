@@ -180,7 +180,7 @@ def status(
     folder = RunFolder.open(path)
     records = folder.trials()
     completed = [record for record in records if record.outcome == "completed" and record.last]
-    best = min(completed, key=lambda record: record.last["valid_normalized_mse"], default=None)
+    best = min(completed, key=lambda record: record.last["valid_error"], default=None)
     facts = {
         **folder.read("state.json"),
         "trials": count_outcomes(records),
@@ -188,7 +188,7 @@ def status(
         if best is None
         else {
             "trial": best.id,
-            "valid_normalized_mse": best.last["valid_normalized_mse"],
+            "valid_error": best.last["valid_error"],
             "parameters": best.parameters,
         },
     }
@@ -200,7 +200,7 @@ def status(
         results.print(f"{stage}: " + ", ".join(f"{number} {name}" for name, number in counts.items() if number))
     if best is not None:
         settings = " ".join(f"{key}={value}" for key, value in best.parameters.items())
-        results.print(f"best: {best.id}, validation error {best.last['valid_normalized_mse']:.4g} ({settings})")
+        results.print(f"best: {best.id}, validation error {best.last['valid_error']:.4g} ({settings})")
 
 
 def _finalists_table(summary: "Summary") -> Table:

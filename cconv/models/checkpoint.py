@@ -27,7 +27,7 @@ class _Card(OpenModel):
 
     data: dict = {}
     data_seed: Seed = 0
-    valid_normalized_mse: Real | None = None
+    valid_error: Real | None = None
 
 
 def save_model(model: Model, folder: Path | str, card: dict) -> None:

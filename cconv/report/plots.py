@@ -29,7 +29,7 @@ def learning_curves_chart(curves: pd.DataFrame, summary: Summary | None = None) 
     stages = stage_colors(list(trials["stage"].unique()))
     for (_, stage), curve in trials.groupby(["name", "stage"]):
         style = {"color": stages[stage], "alpha": 0.6, "marker": ".", "lw": 1}
-        search.plot(curve["updates"], curve["valid_normalized_mse"], **style)
+        search.plot(curve["updates"], curve["valid_error"], **style)
     for stage, color in stages.items():
         search.plot([], [], color=color, label=stage)
     challengers = sorted(set(retrained["name"]) - {BASELINE})
@@ -38,7 +38,7 @@ def learning_curves_chart(curves: pd.DataFrame, summary: Summary | None = None) 
     for name, lines in retrained.groupby("name"):
         for number, (_, curve) in enumerate(lines.groupby("seed")):
             style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
-            finals.plot(curve["updates"], curve["valid_normalized_mse"], marker="." if len(curve) == 1 else "", **style)
+            finals.plot(curve["updates"], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
         axes.set(yscale="log", xlabel="gradient updates", ylabel=_error_label(summary), title=title)
         if summary is not None:
@@ -56,14 +56,14 @@ def budget_chart(curves: pd.DataFrame, summary: Summary) -> Figure:
     """
     figure, panels = new_figure(12, 4.4, columns=2)
     finalists = [entry.id for entry in summary.finalists]
-    is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_normalized_mse"].notna()
+    is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_error"].notna()
     shown = curves[is_shown]
     colors = dict(zip(finalists, sns.color_palette("husl", len(finalists)), strict=True))
     for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
         for name, lines in shown.groupby("name", sort=False):
             for number, (_, curve) in enumerate(lines.groupby("seed")):
                 style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
-                axes.plot(curve[x], curve["valid_normalized_mse"], marker="." if len(curve) == 1 else "", **style)
+                axes.plot(curve[x], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
         axes.set(yscale="log", xlabel=label, ylabel=_error_label(summary))
     trained = shown["updates"][shown["updates"] > 0]
     panels[0].set_xscale("symlog", linthresh=trained.min() if len(trained) else 1)  # least squares takes no update
@@ -83,9 +83,9 @@ def best_so_far_chart(trials: pd.DataFrame, summary: Summary | None = None) -> F
     figure, axes = new_figure(7.5, 4)
     order = range(1, len(trials) + 1)
     sns.scatterplot(
-        x=list(order), y=trials["valid_normalized_mse"], hue=trials["outcome"], style=trials["stage"], ax=axes, zorder=3
+        x=list(order), y=trials["valid_error"], hue=trials["outcome"], style=trials["stage"], ax=axes, zorder=3
     )
-    complete = trials["valid_normalized_mse"].where(trials["outcome"] == "completed")
+    complete = trials["valid_error"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
     axes.set(yscale="log", xlabel="trial", ylabel=f"last {_error_label(summary)}", title="search")
     if summary is not None:
@@ -169,7 +169,7 @@ def ablation_chart(summary: Summary) -> Figure:
     """Validation error on the way from the baseline to the best, one change after the other, each retrained."""
     path = pd.DataFrame(map(dict, summary.ablation.path))
     figure, axes = new_figure(8, 1.2 + 0.38 * len(path))
-    error, low, high = (path[name].astype(float) for name in ("valid_normalized_mse", "low", "high"))
+    error, low, high = (path[name].astype(float) for name in ("valid_error", "low", "high"))
     places, bars = range(len(path)), [(error - low).clip(lower=0), (high - error).clip(lower=0)]
     axes.errorbar(error, places, xerr=bars, fmt="o-", capsize=3, color=MARKED["finalist"])
     axes.set_yticks(places, [str(change) for change in path["change"]])

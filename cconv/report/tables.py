@@ -22,7 +22,7 @@ def trials_table(run: RunFolder) -> pd.DataFrame:
             "stage": record.stage,
             "outcome": record.outcome,
             "updates": record.last["updates"] if record.last else 0,
-            "valid_normalized_mse": record.last["valid_normalized_mse"] if record.last else float("nan"),
+            "valid_error": record.last["valid_error"] if record.last else float("nan"),
             "seconds": record.log[-1]["seconds"] if record.log else 0.0,
             "num_parameters": record.config["num_parameters"],
             **record.parameters,
@@ -65,7 +65,7 @@ def finalists_table(summary: Summary) -> pd.DataFrame:
         rows.append(
             {
                 "model": entry.id,
-                "valid_normalized_mse": entry.valid.normalized_mse,
+                "valid_error": entry.valid.normalized_mse,
                 "normalized_mse": entry.test.normalized_mse,
                 "ci95_low": low,
                 "ci95_high": high,
@@ -170,10 +170,10 @@ def importance_table(importance: Sequence[RungImportance]) -> pd.DataFrame:
 
 def _reference_rows(summary: Summary) -> list[dict]:
     mean, analytic = summary.mean_predictor, summary.analytic
-    row = {"model": MEAN_PREDICTOR, "valid_normalized_mse": mean.valid, "normalized_mse": mean.test}
+    row = {"model": MEAN_PREDICTOR, "valid_error": mean.valid, "normalized_mse": mean.test}
     rows = [row | {"relative_rmse": math.sqrt(mean.test)}]
     if analytic:
-        exact = dict.fromkeys(("valid_normalized_mse", "normalized_mse", "relative_rmse"), 0.0)
+        exact = dict.fromkeys(("valid_error", "normalized_mse", "relative_rmse"), 0.0)
         times = {name: getattr(analytic, name) for name in ("ms_per_frame", "ms_low", "ms_high")}
         rows.append({"model": ANALYTIC} | exact | times)
     return rows
@@ -208,7 +208,7 @@ def _search_points(summary: Summary) -> list[dict]:
             "name": point.id,
             "kind": "search",
             "group": point.stage,
-            "error": point.valid_normalized_mse,
+            "error": point.valid_error,
             "ms": point.ms_per_frame,
             "measured": point.measured,
             "num_parameters": point.num_parameters,

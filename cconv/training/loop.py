@@ -32,7 +32,7 @@ class TrainingState:
         updates: Gradient updates done.
         train_loss: Mean squared error of standardised targets in this update's batch.
         learning_rate: Learning rate of this update.
-        valid_normalized_mse: Validation error, where this update was followed by an evaluation, else None.
+        valid_error: Validation error, where this update was followed by an evaluation, else None.
         seconds: Time since training began, evaluations included.
         diverged: Whether a loss or validation error was not finite; training ends there.
     """
@@ -40,7 +40,7 @@ class TrainingState:
     updates: int
     train_loss: float
     learning_rate: float
-    valid_normalized_mse: float | None
+    valid_error: float | None
     seconds: float
     diverged: bool
 
@@ -96,7 +96,7 @@ def train(
             updates=update,
             train_loss=loss,
             learning_rate=rate,
-            valid_normalized_mse=valid,
+            valid_error=valid,
             seconds=progress.seconds,
             diverged=diverged,
         )

@@ -51,7 +51,7 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
         place: Folder for its progress.
 
     Returns:
-        "model", "seed", "updates", "parameters", "log" (updates, seconds, valid_normalized_mse), and the normalized MSE
+        "model", "seed", "updates", "parameters", "log" (updates, seconds, valid_error), and the normalized MSE
         of the best checkpoint, "valid" and "test", beside those of predicting the mean.
     """
     dataset = open_study_data(study.data, study.seeds.data)
@@ -68,7 +68,7 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
     samples = {"valid": problem.valid_samples, "test": list(study_samples(study, dataset, "test"))}
     errors = {split: normalized_mse(frame_errors(best, each)) for split, each in samples.items()}
     mean = {split: normalized_mse(mean_predictor_error(each, problem.train_samples)) for split, each in samples.items()}
-    log = [{key: entry[key] for key in ("updates", "seconds", "valid_normalized_mse")} for entry in folder.read().log]
+    log = [{key: entry[key] for key in ("updates", "seconds", "valid_error")} for entry in folder.read().log]
     facts = {"model": model, "seed": seed, "updates": updates, "num_parameters": best.num_parameters, "log": log}
     return facts | errors | {"mean_predictor": mean}
 

@@ -18,7 +18,7 @@ from cconv.models.checkpoint import read_card, save_model
 def saved(generator, tmp_path):
     given = problem(generator)
     model = given.build_model(configured(layers=2, first_channels=4, kernel_size=3), 0)
-    save_model(model, tmp_path / "checkpoint", {"valid_normalized_mse": 0.5})
+    save_model(model, tmp_path / "checkpoint", {"valid_error": 0.5})
     return given, model, tmp_path / "checkpoint"
 
 
@@ -26,13 +26,13 @@ def test_round_trip_predicts_the_same(saved):
     given, model, folder = saved
     inputs = given.valid_samples[0].inputs
     assert torch.equal(load_model(folder).predict(inputs), model.predict(inputs))
-    assert read_card(folder) == {"valid_normalized_mse": 0.5}
+    assert read_card(folder) == {"valid_error": 0.5}
 
 
 def test_saving_again_replaces_and_leaves_nothing_behind(saved):
     _, model, folder = saved
-    save_model(model, folder, {"valid_normalized_mse": 0.25})
-    assert read_card(folder)["valid_normalized_mse"] == 0.25
+    save_model(model, folder, {"valid_error": 0.25})
+    assert read_card(folder)["valid_error"] == 0.25
     assert [path.name for path in folder.parent.iterdir()] == ["checkpoint"]
 
 
@@ -46,12 +46,12 @@ def test_a_kill_at_any_time_leaves_a_whole_model(saved):
         child = os.fork()
         if child == 0:
             _end_at(operation)
-            save_model(other, folder, {"valid_normalized_mse": 0.25})
+            save_model(other, folder, {"valid_error": 0.25})
             os._exit(0)
         ended_early = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
         found = load_model(folder).predict(given.valid_samples[0].inputs)
         assert any(torch.equal(found, each) for each in known)
-        assert read_card(folder)["valid_normalized_mse"] in (0.5, 0.25)
+        assert read_card(folder)["valid_error"] in (0.5, 0.25)
         if not ended_early:
             break
     assert torch.equal(found, known[1])
@@ -193,7 +193,7 @@ def test_a_huge_list_of_contents_is_refused(saved):
         ("card.json", "[]", r"card\.json: input should be"),
         ("card.json", '{"data": [1]}', r"card\.json: `data`: input should be a valid dictionary"),
         ("card.json", '{"data_seed": 1e300}', r"card\.json: `data_seed`: input should be a valid integer"),
-        ("card.json", '{"valid_normalized_mse": NaN}', r"card\.json: not JSON .NaN is no number"),
+        ("card.json", '{"valid_error": NaN}', r"card\.json: not JSON .NaN is no number"),
     ],
 )
 def test_a_damaged_description_is_named(saved, name, text, message):

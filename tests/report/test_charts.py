@@ -72,7 +72,7 @@ def test_heights_keep_order_gap_and_range():
 
 
 def test_the_error_axis_shows_all_finalists_and_not_what_diverged(summary):
-    far = changed(summary.search_points[0], valid_normalized_mse=1e9)
+    far = changed(summary.search_points[0], valid_error=1e9)
     points = speed_accuracy_table(changed(summary, search_points=[*summary.search_points, far]))
     low, high = error_range(points, 1.58)
     finalists = points[points["kind"] == "finalist"]

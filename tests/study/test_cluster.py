@@ -130,7 +130,7 @@ def assert_whole(folder):
     for stage, entries in rungs.items():
         for rung in entries:
             reached = {
-                record.id: entry["valid_normalized_mse"]
+                record.id: entry["valid_error"]
                 for record in run.trials_of(stage)
                 for entry in record.log
                 if entry["updates"] == rung["updates"]

@@ -86,9 +86,7 @@ def test_the_reference_trains_what_the_search_stopped_with_what_the_search_spent
 
 
 def test_rungs_hold_the_errors_of_the_logs(run):
-    logs = {
-        record.id: {entry["updates"]: entry["valid_normalized_mse"] for entry in record.log} for record in run.trials()
-    }
+    logs = {record.id: {entry["updates"]: entry["valid_error"] for entry in record.log} for record in run.trials()}
     for rungs in run.read("rungs.json").values():
         for rung in rungs:
             for trial, error in rung["recorded"].items():
@@ -169,9 +167,9 @@ def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, s
     space = fixed(SearchSpace.model_validate(run.read("space.json")), "boundary")
     assert path[0].parameters == space.baseline
     assert len(path) > 1
-    assert all(step.valid_normalized_mse > 0 for step in path)
+    assert all(step.valid_error > 0 for step in path)
     (density,) = [entry for entry in summary.ablation.branches if entry.change == "density"]
-    assert density.valid_normalized_mse > 0
+    assert density.valid_error > 0
 
 
 def test_the_explanation_of_the_recommended_model_and_the_baseline_is_kept(run, summary):

@@ -19,26 +19,24 @@ def run(given, network=LINEAR, seed=0, **options):
 
 def test_training_learns_the_density_rate(generator):
     _, states = run(problem(generator), updates=120, evaluate_every=60)
-    assert states[-1].valid_normalized_mse < 0.1 < states[0].train_loss
+    assert states[-1].valid_error < 0.1 < states[0].train_loss
 
 
 def test_reported_error_is_the_models(generator):
     given = problem(generator)
     model, states = run(given)
-    assert states[-1].valid_normalized_mse == pytest.approx(normalized_mse(frame_errors(model, given.valid_samples)))
+    assert states[-1].valid_error == pytest.approx(normalized_mse(frame_errors(model, given.valid_samples)))
 
 
 def test_evaluations_come_when_due_and_at_the_end(generator):
     _, states = run(problem(generator), updates=7, evaluate_every=3)
     assert [state.updates for state in states] == list(range(1, 8))
-    assert [state.updates for state in states if state.valid_normalized_mse is not None] == [3, 6, 7]
+    assert [state.updates for state in states if state.valid_error is not None] == [3, 6, 7]
 
 
 def test_the_same_seeds_give_the_same_losses(generator):
     given = problem(generator)
-    first, again = (
-        [(state.train_loss, state.valid_normalized_mse) for state in run(given, batch_size=2)[1]] for _ in range(2)
-    )
+    first, again = ([(state.train_loss, state.valid_error) for state in run(given, batch_size=2)[1]] for _ in range(2))
     assert first == again
 
 

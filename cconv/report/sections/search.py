@@ -32,5 +32,5 @@ def _by_error(trials: pd.DataFrame, summary: Summary | None) -> pd.DataFrame:
     """Trials by error, with a row of the mean predictor in its place, where it is known."""
     table = trials.astype(object)  # a row with gaps would turn whole numbers into fractions
     if summary is not None:
-        table.loc[len(table), ["trial", "valid_normalized_mse"]] = [MEAN_PREDICTOR, summary.mean_predictor.valid]
-    return table.sort_values("valid_normalized_mse")
+        table.loc[len(table), ["trial", "valid_error"]] = [MEAN_PREDICTOR, summary.mean_predictor.valid]
+    return table.sort_values("valid_error")

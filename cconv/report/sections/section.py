@@ -46,7 +46,7 @@ class Records:
     @property
     def has_errors(self) -> bool:
         """Whether a trial of a search was evaluated."""
-        return not self.trials.empty and bool(self.trials["valid_normalized_mse"].notna().any())
+        return not self.trials.empty and bool(self.trials["valid_error"].notna().any())
 
 
 class Section:

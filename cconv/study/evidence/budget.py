@@ -20,7 +20,7 @@ def still_falling(points: Sequence[BudgetPoint], margin: float) -> bool:
     """
     if len(points) < 2:
         return True
-    before, last = (point.valid_normalized_mse for point in points[-2:])
+    before, last = (point.valid_error for point in points[-2:])
     return last < (1 - margin) * before
 
 
@@ -31,7 +31,7 @@ def fall_at_the_end(records: Sequence[TrialRecord]) -> float | None:
     """
     falls = []
     for record in records:
-        errors = [(entry["updates"], entry["valid_normalized_mse"]) for entry in record.log]
+        errors = [(entry["updates"], entry["valid_error"]) for entry in record.log]
         begin = (1 - LAST_PART) * errors[-1][0] if errors else 0
         before = [error for updates, error in errors if updates <= begin and error is not None]
         if begin and before and min(before) > 0:
@@ -65,6 +65,6 @@ def _gain(name: str, found: Convergence) -> str:
     first, last = found.points[0], found.points[-1]
     end = "and it was still falling" if found.still_falling else "and more updates bring nothing"
     return (
-        f"The budget of {first.updates:,} updates decided the error of {name}, {first.valid_normalized_mse:.3g}: "
-        f"after {last.updates:,} updates it is {last.valid_normalized_mse:.3g} (validation), {end}."
+        f"The budget of {first.updates:,} updates decided the error of {name}, {first.valid_error:.3g}: "
+        f"after {last.updates:,} updates it is {last.valid_error:.3g} (validation), {end}."
     )

@@ -136,11 +136,7 @@ def _evidence(name: str, records: Sequence[TrialRecord], full_updates: int) -> _
 
 
 def _errors_by_updates(record: TrialRecord) -> Mapping[int, float]:
-    return {
-        entry["updates"]: entry["valid_normalized_mse"]
-        for entry in record.log
-        if entry["valid_normalized_mse"] is not None
-    }
+    return {entry["updates"]: entry["valid_error"] for entry in record.log if entry["valid_error"] is not None}
 
 
 def _narrow_choice(parameter: Choice, evidence: _Evidence) -> tuple[Choice, str]:

@@ -41,7 +41,7 @@ def choose_finalists(
         if record.outcome == "completed" and record.last is not None:
             distinct.setdefault(identity(record.parameters), record)
     by_id = {record.id: record for record in distinct.values()}
-    errors = {trial: record.last["valid_normalized_mse"] for trial, record in by_id.items()}
+    errors = {trial: record.last["valid_error"] for trial, record in by_id.items()}
     front = pareto_front({trial: (errors[trial], cost[trial]) for trial in by_id})[::-1]
     enough = [trial for trial in front if accurate_enough is not None and errors[trial] <= accurate_enough]
     if len(enough) > count:

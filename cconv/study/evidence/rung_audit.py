@@ -82,7 +82,7 @@ def spearman_interval(correlation: float, trials: int) -> list[float] | None:
 
 def _errors_at_both(records: Sequence[TrialRecord], updates: int) -> tuple[np.ndarray, np.ndarray]:
     completed = [record for record in records if record.outcome == "completed" and record.last]
-    pairs = [(record.error_at(updates), record.last["valid_normalized_mse"]) for record in completed]
+    pairs = [(record.error_at(updates), record.last["valid_error"]) for record in completed]
     at_rung, at_full = np.array([pair for pair in pairs if pair[0] is not None]).reshape(-1, 2).T
     return at_rung, at_full
 

@@ -43,7 +43,7 @@ def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
     for record in records:
         spent += record.log[-1]["updates"] if record.log else 0
         if record.outcome == "completed" and record.last is not None:
-            best = min(best, record.last["valid_normalized_mse"])
+            best = min(best, record.last["valid_error"])
         if best < float("inf"):
             curve.append((spent, best))
     return curve
@@ -52,7 +52,7 @@ def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
 def learning_curves(records: Sequence[TrialRecord]) -> dict[str, list[tuple[int, float]]]:
     """(updates, validation error) at each evaluation of every completed trial whose errors are all finite, by id."""
     curves = {
-        record.id: [(entry["updates"], entry["valid_normalized_mse"]) for entry in record.log]
+        record.id: [(entry["updates"], entry["valid_error"]) for entry in record.log]
         for record in records
         if record.outcome == "completed" and record.log
     }

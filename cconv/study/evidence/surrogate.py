@@ -108,7 +108,7 @@ def trials_at(
 
 def _error_at(record: TrialRecord, updates: int, after: int, useless_error: float) -> float | None:
     if record.log and after < record.log[-1]["updates"] <= updates:
-        error = record.log[-1]["valid_normalized_mse"]
+        error = record.log[-1]["valid_error"]
         useless = error is None or error > useless_error
         if record.outcome == "diverged" or (record.outcome == "stopped" and useless):
             return useless_error

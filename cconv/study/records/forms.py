@@ -20,7 +20,7 @@ class Entry(OpenModel):
     """A line of log.jsonl."""
 
     updates: Count
-    valid_normalized_mse: NonNegative | None
+    valid_error: NonNegative | None
     seconds: NonNegative
     train_loss: NonNegative | None = None
     learning_rate: Real | None = None

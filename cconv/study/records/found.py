@@ -209,7 +209,7 @@ class AblationStep(StrictModel):
     Attributes:
         change: The hyperparameter or feature that changed.
         parameters: Hyperparameters after the change.
-        valid_normalized_mse: Validation error, mean over the seeds.
+        valid_error: Validation error, mean over the seeds.
         low: Smallest error of a seed.
         high: Largest.
         flops_per_particle: Operations of one particle's prediction.
@@ -218,7 +218,7 @@ class AblationStep(StrictModel):
 
     change: str
     parameters: dict[str, Value]
-    valid_normalized_mse: NonNegative | None
+    valid_error: NonNegative | None
     low: NonNegative | None
     high: NonNegative | None
     flops_per_particle: NonNegative | None
@@ -247,14 +247,14 @@ class BudgetPoint(StrictModel):
     Attributes:
         id: Name of its trainings.
         updates: Gradient updates of each.
-        valid_normalized_mse: Validation error, mean over the seeds.
+        valid_error: Validation error, mean over the seeds.
         by_seed: Validation error of each training.
         train_seconds: Duration of a training, mean.
     """
 
     id: Id
     updates: Count
-    valid_normalized_mse: NonNegative
+    valid_error: NonNegative
     by_seed: dict[str, NonNegative]
     train_seconds: NonNegative
 

@@ -316,7 +316,7 @@ class SearchPoint(StrictModel):
 
     id: Id
     stage: Name
-    valid_normalized_mse: NonNegative
+    valid_error: NonNegative
     ms_per_frame: NonNegative
     measured: Flag
     num_parameters: Count

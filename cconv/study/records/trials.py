@@ -27,7 +27,7 @@ class TrialRecord:
         stage: "closed_form", "initialization", "random", "adaptive", "finalists" or "train".
         parameters: Hyperparameters that were drawn.
         config: Resolved network and training settings, seeds, number of parameters.
-        log: One entry an evaluation: updates, train_loss, valid_normalized_mse, learning_rate, seconds, diverged.
+        log: One entry an evaluation: updates, train_loss, valid_error, learning_rate, seconds, diverged.
         outcome: One of `OUTCOMES`; "interrupted" if the run ended before the trial did.
         reason: Why it failed, or "".
     """
@@ -48,17 +48,17 @@ class TrialRecord:
     @property
     def best(self) -> float:
         """Smallest validation error of the log, that of the checkpoint; infinity where there is none."""
-        finite = (entry["valid_normalized_mse"] for entry in self.log)
+        finite = (entry["valid_error"] for entry in self.log)
         return min((error for error in finite if error is not None), default=math.inf)
 
     def error_at(self, updates: int) -> float | None:
         """Validation error after a number of updates; None if it was not measured there or not finite."""
-        return next((entry["valid_normalized_mse"] for entry in self.log if entry["updates"] == updates), None)
+        return next((entry["valid_error"] for entry in self.log if entry["updates"] == updates), None)
 
     @property
     def last(self) -> dict | None:
         """The last evaluation with a finite error, or None."""
-        finite = [entry for entry in self.log if entry["valid_normalized_mse"] is not None]
+        finite = [entry for entry in self.log if entry["valid_error"] is not None]
         return finite[-1] if finite else None
 
 

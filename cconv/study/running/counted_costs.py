@@ -78,7 +78,7 @@ def points_of_search(
         return SearchPoint(
             id=record.id,
             stage=record.stage,
-            valid_normalized_mse=record.last["valid_normalized_mse"],
+            valid_error=record.last["valid_error"],
             ms_per_frame=predicted if measurement is None else measurement.ms_per_frame,
             measured=measurement is not None,
             num_parameters=record.config["num_parameters"],

@@ -201,7 +201,7 @@ class OptunaMirror:
     def on_trial_result(self, trial: str, entry: Mapping) -> None:
         """Add the error of an evaluation; a huge one where the trial diverged, so that samplers keep away."""
         frozen = self._frozen(trial)
-        error = entry["valid_normalized_mse"]
+        error = entry["valid_error"]
         value = DIVERGED_ERROR if entry["diverged"] or error is None else error
         if entry["updates"] not in frozen.intermediate_values and not frozen.state.is_finished():
             Trial(self._study, frozen._trial_id).report(value, entry["updates"])

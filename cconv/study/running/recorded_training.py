@@ -40,7 +40,7 @@ def train_recorded(
     An error of the training is an outcome of the job, not an exception. A training that hangs ends this process.
     """
     limit = _seconds_limit(study, training)
-    last = {"updates": 0, "valid_normalized_mse": None, "diverged": False, "seconds": 0.0}
+    last = {"updates": 0, "valid_error": None, "diverged": False, "seconds": 0.0}
     outcome, reason = None, ""
     try:
         with Attempt(job.folder, HANGING * limit) as attempt:
@@ -69,7 +69,7 @@ def _trial(
     job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem, attempt: Attempt
 ) -> Iterator[dict]:
     def check_before_writing(state: TrainingState) -> None:
-        if state.valid_normalized_mse is not None or state.diverged:
+        if state.valid_error is not None or state.diverged:
             attempt.check()
 
     folder = TrialFolder(job.folder)

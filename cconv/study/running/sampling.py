@@ -139,7 +139,7 @@ class _Scalarization:
     def of(
         cls, records: Sequence[TrialRecord], costs: Mapping[str, float], error_weight: float, useless_error: float
     ) -> "_Scalarization":
-        known = [record.last["valid_normalized_mse"] for record in records if record.last is not None]
+        known = [record.last["valid_error"] for record in records if record.last is not None]
         of_errors = _log_span([min(error, useless_error) for error in known])
         return cls(of_errors, _log_span([costs[record.id] for record in records]), error_weight, useless_error)
 
@@ -207,9 +207,9 @@ def _as_optuna(
     from optuna.trial import TrialState, create_trial
 
     values = {
-        entry["updates"]: scalarize(entry["valid_normalized_mse"], costs[record.id])
+        entry["updates"]: scalarize(entry["valid_error"], costs[record.id])
         for entry in record.log
-        if entry["valid_normalized_mse"] is not None
+        if entry["valid_error"] is not None
     }
     complete = record.outcome == "completed" and full_updates in values
     states = {"interrupted": TrialState.RUNNING, "failed": TrialState.FAIL}

@@ -67,20 +67,20 @@ def run_trial(
     try:
         for state in states:
             on_update(state)
-            if state.valid_normalized_mse is None and not state.diverged:
+            if state.valid_error is None and not state.diverged:
                 if state.seconds > seconds_limit:
                     return
                 continue
             entry = _entry(state)
-            if not state.diverged and state.valid_normalized_mse < best:
-                best = state.valid_normalized_mse
-                save_model(model, folder.checkpoint, card | {"valid_normalized_mse": best, "updates": state.updates})
+            if not state.diverged and state.valid_error < best:
+                best = state.valid_error
+                save_model(model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
             folder.append(entry)
             save_progress(folder.progress, model, progress)
             yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
-            save_model(model, folder.checkpoint, card | {"valid_normalized_mse": None})
+            save_model(model, folder.checkpoint, card | {"valid_error": None})
         raise
 
 
@@ -119,7 +119,7 @@ def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progr
 
 def _best_so_far(folder: TrialFolder) -> float:
     """Validation error of the checkpoint of an earlier process; infinity where there is none."""
-    known = read_card(folder.checkpoint).get("valid_normalized_mse") if folder.progress.is_file() else None
+    known = read_card(folder.checkpoint).get("valid_error") if folder.progress.is_file() else None
     return math.inf if known is None else known
 
 
@@ -127,7 +127,7 @@ def _entry(state: TrainingState) -> dict:
     return {
         "updates": state.updates,
         "train_loss": _finite(state.train_loss),
-        "valid_normalized_mse": _finite(state.valid_normalized_mse),
+        "valid_error": _finite(state.valid_error),
         "learning_rate": state.learning_rate,
         "seconds": state.seconds,
         "diverged": state.diverged,

@@ -61,7 +61,7 @@ class StopsByRungs:
 
     def goes_on(self, name: str, entry: Mapping) -> bool:
         """Whether a trial goes on after an evaluation."""
-        error = entry["valid_normalized_mse"]
+        error = entry["valid_error"]
         if entry["diverged"] or error is None or not math.isfinite(error):
             return False
         within = self._table.record(name, entry["updates"], error)

@@ -115,7 +115,7 @@ def _step(session: Session, stage: str, change: str, parameters: Mapping) -> Abl
     return AblationStep(
         change=change,
         parameters=parameters,
-        valid_normalized_mse=float(np.mean(errors)) if errors else None,
+        valid_error=float(np.mean(errors)) if errors else None,
         low=min(errors, default=None),
         high=max(errors, default=None),
         flops_per_particle=records[0].config["flops_per_particle"] if records else None,

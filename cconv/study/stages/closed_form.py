@@ -251,13 +251,13 @@ def _fit_and_record(
     entry = {
         "updates": 0,
         "train_loss": None,
-        "valid_normalized_mse": error,
+        "valid_error": error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
         "diverged": False,
     }
     folder.append(entry)
-    card = config | provenance(study) | {"valid_normalized_mse": entry["valid_normalized_mse"], "updates": 0}
+    card = config | provenance(study) | {"valid_error": entry["valid_error"], "updates": 0}
     save_model(model.eval(), folder.checkpoint, card)
     folder.finish("completed")
 

@@ -100,7 +100,7 @@ def _point(session: Session, finalist: str, updates: int) -> BudgetPoint | None:
     return BudgetPoint(
         id=finalist,
         updates=updates,
-        valid_normalized_mse=float(np.mean(errors)),
+        valid_error=float(np.mean(errors)),
         by_seed=dict(zip([record.id for record in records], errors, strict=True)),
         train_seconds=float(np.mean([record.log[-1]["seconds"] for record in records])),
     )

@@ -86,6 +86,6 @@ def _by_first_rung(finals: Sequence[TrialRecord], num_trials: int, rungs: Sequen
     for record in finals:
         spent += rungs[-1] - rungs[0]
         if record.outcome == "completed" and record.last:
-            best = min(best, record.last["valid_normalized_mse"])
+            best = min(best, record.last["valid_error"])
             curve.append((spent, best))
     return SearchStrategy(updates=spent, best_valid=best if curve else None, curve=curve)

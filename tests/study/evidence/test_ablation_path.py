@@ -27,7 +27,7 @@ BEST = {"architecture": "radial_net", "terms": 8, "width": 8, "rate": 1e-2}
 
 
 def record(number, parameters, error):
-    log = [{"updates": 9, "valid_normalized_mse": error}]
+    log = [{"updates": 9, "valid_error": error}]
     return TrialRecord(
         id=f"r{number}", stage="random", parameters=parameters, config={}, log=log, outcome="completed", reason=""
     )

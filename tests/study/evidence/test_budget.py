@@ -8,7 +8,7 @@ from cconv.study.records.trials import TrialRecord
 
 def record(errors, every=10):
     log = [
-        {"updates": every * number, "valid_normalized_mse": error, "seconds": 1.0}
+        {"updates": every * number, "valid_error": error, "seconds": 1.0}
         for number, error in enumerate(errors, start=1)
     ]
     return TrialRecord(
@@ -17,9 +17,7 @@ def record(errors, every=10):
 
 
 def point(name, updates, error):
-    return BudgetPoint(
-        id=name, updates=updates, valid_normalized_mse=error, by_seed={"seed_1": error}, train_seconds=1.0
-    )
+    return BudgetPoint(id=name, updates=updates, valid_error=error, by_seed={"seed_1": error}, train_seconds=1.0)
 
 
 def test_the_fall_is_that_of_the_best_error_in_the_last_quarter_of_the_updates():

@@ -39,7 +39,7 @@ def drawn(rng):
 
 
 def record(number, parameters, errors, outcome="completed"):
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in errors.items()]
+    log = [{"updates": updates, "valid_error": error} for updates, error in errors.items()]
     return TrialRecord(
         id=f"r{number}", stage="random", parameters=parameters, config={}, log=log, outcome=outcome, reason=""
     )

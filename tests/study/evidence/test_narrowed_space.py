@@ -50,7 +50,7 @@ def error_of(parameters, message=10.0):
 
 def record_of(number, parameters, error, reached=FULL, outcome=None):
     log = [
-        {"updates": updates, "valid_normalized_mse": error * (1 + 10 / updates)}
+        {"updates": updates, "valid_error": error * (1 + 10 / updates)}
         for updates in (10, 30, FULL)
         if updates <= reached
     ]
@@ -68,7 +68,7 @@ def records_of(count, outcome=None, **strengths):
 
 def asha_records(count, **strengths):
     """A third of the trials goes on after 10 updates, and a third of these after 30."""
-    by_error = sorted(records_of(count, **strengths), key=lambda record: record.last["valid_normalized_mse"])
+    by_error = sorted(records_of(count, **strengths), key=lambda record: record.last["valid_error"])
     reached = [FULL if rank < count / 9 else 30 if rank < count / 3 else 10 for rank in range(count)]
     return [
         record_of(number, record.parameters, error_of(record.parameters, **strengths), updates)

@@ -13,7 +13,7 @@ from cconv.study.records.trials import TrialRecord
 
 
 def record(name, error, outcome="completed", **parameters):
-    log = [{"updates": 9, "valid_normalized_mse": error, "seconds": 1.0}]
+    log = [{"updates": 9, "valid_error": error, "seconds": 1.0}]
     return TrialRecord(
         id=name, stage="random", parameters=parameters or {"id": name}, config={}, log=log, outcome=outcome, reason=""
     )

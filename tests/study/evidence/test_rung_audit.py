@@ -14,7 +14,7 @@ def rng():
 
 
 def trial(name, errors, outcome="completed"):
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in errors.items()]
+    log = [{"updates": updates, "valid_error": error} for updates, error in errors.items()]
     return TrialRecord(id=f"{name}", stage="random", parameters={}, config={}, log=log, outcome=outcome, reason="")
 
 

@@ -8,7 +8,7 @@ from cconv.study.records.trials import TrialRecord
 
 
 def trial(number, errors):
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in errors.items()]
+    log = [{"updates": updates, "valid_error": error} for updates, error in errors.items()]
     return TrialRecord(id=f"{number}", stage="random", parameters={}, config={}, log=log, outcome="stopped", reason="")
 
 

@@ -30,7 +30,7 @@ def curves():
 
 
 def trial(name, log, outcome="completed"):
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in log]
+    log = [{"updates": updates, "valid_error": error} for updates, error in log]
     return TrialRecord(id=name, stage="random", parameters={}, config={}, log=log, outcome=outcome, reason="")
 
 

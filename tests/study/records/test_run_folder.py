@@ -23,7 +23,7 @@ ENVIRONMENT = {
     "data": {"sha256": "0"},
     "data_findings": [],
 }
-ENTRY = {"updates": 5, "train_loss": 1.0, "valid_normalized_mse": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
+ENTRY = {"updates": 5, "train_loss": 1.0, "valid_error": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
 
 def test_a_trial_reads_back_as_written(tmp_path):
@@ -58,7 +58,7 @@ def test_a_diverged_last_entry_is_no_error(tmp_path):
     trial = RunFolder(tmp_path).trial("random_0000")
     trial.start(CONFIG)
     trial.append(ENTRY)
-    trial.append(ENTRY | {"updates": 10, "valid_normalized_mse": None})
+    trial.append(ENTRY | {"updates": 10, "valid_error": None})
     assert trial.read().last["updates"] == 5
 
 

@@ -20,7 +20,7 @@ PARAMETERS = [
 def record(number, parameters):
     return TrialRecord(
         id=f"random_{number:04d}", stage="random", parameters=parameters, config={"num_parameters": 1},
-        log=[{"updates": 9, "valid_normalized_mse": 0.5, "seconds": 1.0}], outcome="completed", reason="",
+        log=[{"updates": 9, "valid_error": 0.5, "seconds": 1.0}], outcome="completed", reason="",
     )  # fmt: skip
 
 

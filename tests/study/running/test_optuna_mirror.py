@@ -42,7 +42,7 @@ def trials(path):
 
 
 def entry(updates, error):
-    return {"updates": updates, "valid_normalized_mse": error, "diverged": error is None}
+    return {"updates": updates, "valid_error": error, "diverged": error is None}
 
 
 def tell(observer, name, errors, outcome, parameters=None):

@@ -50,9 +50,9 @@ def error_of(parameters):
 
 def record_of(number, parameters, outcome="completed", reached=FULL):
     errors = [(updates, error_of(parameters) * (1 + 10 / updates)) for updates in (10, 30, FULL) if updates <= reached]
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in errors]
+    log = [{"updates": updates, "valid_error": error} for updates, error in errors]
     if outcome == "diverged":
-        log[-1]["valid_normalized_mse"] = None
+        log[-1]["valid_error"] = None
     return TrialRecord(
         id=f"random_{number:04d}", stage="random", parameters=parameters, config={}, log=log, outcome=outcome, reason=""
     )

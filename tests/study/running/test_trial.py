@@ -28,7 +28,7 @@ def test_log_config_and_checkpoint_agree(generator, tmp_path):
     assert record.config["network"]["kernel_size"] == 4
     assert record.config["training"]["learning_rate"] == 0.02
     assert load_model(folder.checkpoint).num_parameters == record.config["num_parameters"]
-    assert read_card(folder.checkpoint)["valid_normalized_mse"] == min(e["valid_normalized_mse"] for e in entries)
+    assert read_card(folder.checkpoint)["valid_error"] == min(e["valid_error"] for e in entries)
 
 
 def test_every_entry_is_on_disk_before_it_is_seen(generator, tmp_path):
@@ -42,7 +42,7 @@ def test_divergence_is_a_recorded_outcome(generator, tmp_path):
     folder = RunFolder(tmp_path).trial("random_0000")
     entries = list(trial(problem(generator), folder, {"learning_rate": 1e3, "layers": 12, "activation": "leaky_relu"}))
     assert entries[-1]["diverged"]
-    assert entries[-1]["valid_normalized_mse"] is None
+    assert entries[-1]["valid_error"] is None
     assert json.loads((folder.path / "log.jsonl").read_text().splitlines()[-1])["diverged"]
 
 
@@ -68,7 +68,7 @@ def test_a_trial_that_was_left_goes_on_to_the_same_log_and_checkpoint(generator,
     cut.progress.write_bytes(progress)
     rest = list(trial(given, cut))
     assert [entry["updates"] for entry in rest] == [4, 6]
-    errors = [[entry["valid_normalized_mse"] for entry in folder.log()] for folder in (whole, cut)]
+    errors = [[entry["valid_error"] for entry in folder.log()] for folder in (whole, cut)]
     assert errors[0] == pytest.approx(errors[1], rel=1e-6)
     assert read_card(cut.checkpoint)["updates"] == read_card(whole.checkpoint)["updates"]
 

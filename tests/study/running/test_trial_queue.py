@@ -22,7 +22,7 @@ class Watcher:
 
 
 def entry(updates, error, diverged=False):
-    return {"updates": updates, "valid_normalized_mse": error, "seconds": 1.0, "diverged": diverged}
+    return {"updates": updates, "valid_error": error, "seconds": 1.0, "diverged": diverged}
 
 
 def job(run, number):

@@ -126,7 +126,7 @@ def run(finished_run):
 
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
     screened = [record for record in run.trials() if record.stage == "closed_form"]
-    best = min(screened, key=lambda record: record.last["valid_normalized_mse"])
+    best = min(screened, key=lambda record: record.last["valid_error"])
     entry = run.summary().finalist(best.id)
     (record,) = run.retrainings()[entry.id]
     assert record.is_closed_form
@@ -153,7 +153,7 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
     def fit(session, parameters, folder, stage, seed, ridge):
         folder.start({"stage": stage, "parameters": parameters})
         error = errors[" ".join(branch for branch in OPTIONAL_FEATURES if parameters[branch])]
-        folder.append({"updates": 0, "valid_normalized_mse": error, "seconds": 1.0})
+        folder.append({"updates": 0, "valid_error": error, "seconds": 1.0})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
     space = space_of(walls=[True, False], density=[True, False])

@@ -16,7 +16,7 @@ def retrain(run, finalist, seed, outcome="completed", reason="", errors=(0.5, 0.
     folder = run.finalist(finalist, seed)
     folder.start(CONFIG | {"init_seed": seed})
     for updates, error in enumerate(errors, start=1):
-        folder.append({"updates": updates, "valid_normalized_mse": error, "seconds": 1.0})
+        folder.append({"updates": updates, "valid_error": error, "seconds": 1.0})
     folder.finish(outcome, reason)
 
 

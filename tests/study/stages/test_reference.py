@@ -10,7 +10,7 @@ RUNGS = [10, 30, 90]
 
 def trial(number, *errors):
     """A trial with an error at each rung that it reached."""
-    log = [{"updates": updates, "valid_normalized_mse": error} for updates, error in zip(RUNGS, errors, strict=False)]
+    log = [{"updates": updates, "valid_error": error} for updates, error in zip(RUNGS, errors, strict=False)]
     outcome = "completed" if len(errors) == len(RUNGS) else "stopped"
     return TrialRecord(
         id=f"random_{number:04d}", stage="random", parameters={}, config={}, log=log, outcome=outcome, reason=""
