@@ -25,6 +25,7 @@ from cconv.study.evidence.effects import effects
 from cconv.study.evidence.importance import importance_by_rung
 from cconv.study.evidence.partial_dependence import partial_dependence
 from cconv.study.evidence.rung_audit import spearman_interval
+from cconv.study.records.found import RungImportance
 from cconv.study.records.trials import TrialRecord
 
 SIZE, KERNEL, EXTENT = "num_parameters", "kernel_size", "filter_extent"
@@ -223,7 +224,7 @@ def with_size(sample: Sample) -> SearchSpace:
 def importance(sample: Sample, space: SearchSpace) -> dict:
     """Importances of the sample, by all methods."""
     (entry,) = importance_by_rung(as_records(sample, space), space, [sample.updates], useless_error=1.0)
-    return entry
+    return entry.model_dump()
 
 
 def departure_from_uniform(search_3: pd.DataFrame) -> dict[str, float]:
@@ -392,7 +393,7 @@ def _cells(figures: Mapping, name: str) -> Iterator[str]:
 
 def _importance_line(figures: Mapping) -> str:
     entry = figures["importance"]
-    (sentence,) = decidable({"importance": [entry]})
+    (sentence,) = decidable([RungImportance(**entry)])
     strongest = "; ".join(
         f"{called} {', '.join(_strongest_by(entry, method))}"
         for called, method in (("by f-ANOVA", "f_anova"), ("by PED-ANOVA", "ped_anova"))
@@ -458,7 +459,7 @@ random, so that errors on unseen scenes are unknown.
 def draw(search_2: pd.DataFrame, search_3: pd.DataFrame, figures: Mapping, out: Path) -> None:
     """Charts of importance in both searches, and of partial dependence in the complete one."""
     for name, search in (("survival", "search_2"), ("complete", "search_3")):
-        chart = importance_chart([figures[name]["importance"]], title=figures[name]["title"])
+        chart = importance_chart([RungImportance(**figures[name]["importance"])], title=figures[name]["title"])
         chart.savefig(out / f"importance_{search}.png", dpi=90)
     sample = next(sample for sample in samples(search_2, search_3) if sample.name == "complete")
     records, judged = as_records(sample, sample.space), figures["complete"]["importance"]["parameters"]

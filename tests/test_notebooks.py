@@ -39,9 +39,9 @@ def code_cells(path):
 def whole_run(tmp_path):
     """A copy of the committed run with everything that can be recorded."""
     run = RunFolder(shutil.copytree(ANALYSIS / "sample_run", tmp_path / "run"))
-    run.write("summary.json", whole_summary(run.read("summary.json")))
-    (run.path / "explanation").mkdir(exist_ok=True)
-    for model in {run.read("summary.json")["recommended"]["id"], "baseline"}:
+    summary = whole_summary(run.summary())
+    run.write_summary(summary)
+    for model in summary.explained:
         np.savez(run.path / "explanation" / f"{model}.npz", **explanation())
     return run
 

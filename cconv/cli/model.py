@@ -51,9 +51,8 @@ def train(
         raise typer.Exit(1)
     folder.finish("completed")
     best = min(entry["valid_error"] for entry in entries)
-    results.print(
-        f"Best validation error {best:.4g} ({problem.objective.label}). Checkpoint: {folder.checkpoint}", soft_wrap=True
-    )
+    figures = f"{best:.4g} ({problem.objective.label})"
+    results.print(f"Best validation error {figures}. Checkpoint: {folder.checkpoint}", soft_wrap=True)
 
 
 def fit(

@@ -12,6 +12,7 @@ from cconv.errors import CConvError, ConfigError
 
 if TYPE_CHECKING:
     from cconv.study.records.run_folder import RunFolder
+    from cconv.study.records.summary import Summary
 
 # Commands import what they run inside, as torch and ray take seconds to load and `--help` should not.
 
@@ -162,10 +163,10 @@ def _run_stages(folder: "RunFolder", address: str | None, storage: str | None, s
     report = write_report(folder)
     if summary is not None:
         results.print(_finalists_table(summary))
-        results.print(summary["recommended"]["reason"])
-        if summary["budget"]:
-            results.print(summary["budget"])
-        results.print(f"Study finished in {summary['wall_seconds'] / 60:.1f} minutes.")
+        results.print(summary.recommended.reason)
+        if summary.budget:
+            results.print(summary.budget)
+        results.print(f"Study finished in {summary.wall_seconds / 60:.1f} minutes.")
     results.print(f"Report: {report}", soft_wrap=True)
 
 
@@ -203,26 +204,26 @@ def status(
         results.print(f"best: {best.id}, validation error {best.last['valid_error']:.4g} ({settings})")
 
 
-def _finalists_table(summary: dict) -> Table:
+def _finalists_table(summary: "Summary") -> Table:
     table = Table(
-        title=f"{summary['study']}: test error (normalized MSE) and cost of the finalists",
+        title=f"{summary.study}: test error ({summary.task.error}) and cost of the finalists",
         title_justify="left",
         padding=(0, 0),
     )
     table.add_column("model", overflow="fold")
     for name in ("error", "95 % interval", "ms per frame", "parameters", "stable"):
         table.add_column(name, justify="right", no_wrap=True)
-    for entry in sorted(summary["finalists"], key=lambda entry: entry["test"]["normalized_mse"]):
-        test, cost = entry["test"], entry["cost"]
-        mark = " *" if entry["id"] == summary["recommended"]["id"] else ""
+    for entry in sorted(summary.finalists, key=lambda entry: entry.test.normalized_mse):
+        mark = " *" if entry.id == summary.recommended.id else ""
         table.add_row(
-            entry["id"] + mark,
-            f"{test['normalized_mse']:.4g}",
-            "none" if test["ci95"] is None else "{:.3g}–{:.3g}".format(*test["ci95"]),
-            f"{cost['ms_per_frame']:.2f}",
-            f"{entry['num_parameters']:,}",
-            "yes" if entry["stability"]["stable"] else "no",
+            entry.id + mark,
+            f"{entry.test.normalized_mse:.4g}",
+            "none" if entry.test.ci95 is None else "{:.3g}–{:.3g}".format(*entry.test.ci95),
+            f"{entry.cost.ms_per_frame:.2f}",
+            f"{entry.num_parameters:,}",
+            "yes" if entry.stability.stable else "no",
         )
-    table.add_row("predicting the mean", f"{summary['mean_predictor']['test']:.4g}")
-    table.add_row("analytic SPH", "0", "", f"{summary['analytic']['ms_per_frame']:.2f}")
+    table.add_row("predicting the mean", f"{summary.mean_predictor.test:.4g}")
+    if summary.analytic is not None:
+        table.add_row("analytic SPH", "0", "", f"{summary.analytic.ms_per_frame:.2f}")
     return table

@@ -38,12 +38,11 @@ def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
         sample: A frame that the model was not trained on. Filters are scaled by its mass and mean density.
 
     Returns:
-        "task"; "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
+        "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
         "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns.
     """
     spacing = sample.inputs.units.length
     return {
-        "task": np.array(model.config.task),
         "particle_spacing": np.array(spacing),
         "positions": (sample.inputs.positions * spacing).numpy(),
         "target": (sample.target * sample.target_unit).numpy(),

@@ -32,11 +32,15 @@ class ErrorTable:
 class Objective(ABC):
     """An error that models are compared by.
 
-    `name` is what tasks, cards and summaries call it, `label` what charts do.
+    Attributes:
+        name: Name by which tasks ask for it.
+        label: What charts and messages call it.
+        meaning: What it is, in sentences for readers.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
+    meaning: ClassVar[str]
 
     @abstractmethod
     def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
@@ -68,6 +72,11 @@ class NormalizedMSE(Objective):
 
     name = "normalized_mse"
     label = "normalized MSE"
+    meaning = (
+        "Mean squared error divided by the variance of the target over the training split: 0 is perfect. Always "
+        "predicting the training mean scores 1 on the training split, more or less on others. Its root is the relative "
+        "RMSE."
+    )
 
     def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
         """Error over all particles of the samples; arguments as of `Objective.error`."""

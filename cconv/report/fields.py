@@ -5,7 +5,7 @@ Neither Ray nor torch is imported.
 
 import io
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -14,18 +14,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cconv.errors import DataError
-from cconv.report.colors import MARKED
+from cconv.report.colors import ANALYTIC_COLOR, MARKED
 from cconv.report.plots import new_figure
 from cconv.study.records.run_folder import RunFolder
 
 Explanation = Mapping[str, np.ndarray]
-_SYMBOLS = {"density_rate": "Dρ/Dt", "density_gradient": "∇ρ"}
-_LEARNED, _ANALYTIC = MARKED["recommended"], "#222222"
+_LEARNED = MARKED["recommended"]
 
 
-def read_explanations(run: RunFolder) -> dict[str, dict[str, np.ndarray]]:
-    """Arrays of each explained finalist by id, from ``explanation/<id>.npz``; empty for a run without any."""
-    return {path.stem: _read(path) for path in sorted((run.path / "explanation").glob("*.npz"))}
+def read_explanations(run: RunFolder, explained: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Arrays of each explained finalist by id, from ``explanation/<id>.npz``.
+
+    Raises:
+        DataError: If a file is missing or damaged.
+    """
+    return {name: _read(run.path / "explanation" / f"{name}.npz") for name in explained}
 
 
 def filters_chart(explanation: Explanation) -> Figure:
@@ -49,12 +52,16 @@ def filters_chart(explanation: Explanation) -> Figure:
     return figure
 
 
-def fields_chart(explanation: Explanation) -> Figure:
-    """Target, prediction and error on a frame; in three dimensions a slice of two spacings through the middle."""
+def fields_chart(explanation: Explanation, symbol: str) -> Figure:
+    """Target, prediction and error on a frame; in three dimensions a slice of two spacings through the middle.
+
+    Args:
+        explanation: Arrays of a model.
+        symbol: Symbol of the field; vectors are drawn by their length.
+    """
     shown = _slice(explanation)
     positions, target, prediction = (explanation[name][shown] for name in ("positions", "target", "prediction"))
     error = np.sqrt(explanation["error"][shown])
-    symbol = _SYMBOLS.get(str(explanation["task"]), "field")
     if target.shape[1] > 1:
         target, prediction, symbol = _size(target), _size(prediction), f"|{symbol}|"
     figure, panels = new_figure(13, 3.9, columns=3)
@@ -107,7 +114,7 @@ def _draw_axis(axes: Axes, explanation: Explanation, axis: int, spacing: float) 
     names, name = list(explanation["feature_names"]), "xyz"[axis]
     feature, component = (names.index("ρ"), axis) if learned.shape[2] > 1 else (names.index(f"v_{name}"), 0)
     line = explanation["line"] / spacing
-    axes.plot(line, analytic[:, feature, component], color=_ANALYTIC, lw=3, alpha=0.25, label="analytic: ∇W")
+    axes.plot(line, analytic[:, feature, component], color=ANALYTIC_COLOR, lw=3, alpha=0.25, label="analytic: ∇W")
     axes.plot(line, learned[:, feature, component], color=_LEARNED, lw=1.4, label="learned")
     axes.set(xlabel=f"offset along {name} [spacings]", title=f"{names[feature]} along {name}")
     axes.legend(fontsize=8)
@@ -115,7 +122,7 @@ def _draw_axis(axes: Axes, explanation: Explanation, axis: int, spacing: float) 
 
 def _draw_radial(axes: Axes, explanation: Explanation, spacing: float) -> None:
     radii = explanation["radii"] / spacing
-    axes.plot(radii, explanation["analytic_radial"], color=_ANALYTIC, lw=3, alpha=0.25, label="analytic: W'(r)")
+    axes.plot(radii, explanation["analytic_radial"], color=ANALYTIC_COLOR, lw=3, alpha=0.25, label="analytic: W'(r)")
     axes.plot(radii, explanation["learned_radial"], color=_LEARNED, lw=1.4, label="learned, mean over directions")
     band = {"color": _LEARNED, "alpha": 0.2, "lw": 0, "label": "9 of 10 directions"}
     axes.fill_between(radii, explanation["learned_radial_low"], explanation["learned_radial_high"], **band)

@@ -1,26 +1,27 @@
 """Charts of what decides the error. Each function returns a matplotlib figure; showing or saving it is the caller's."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from cconv.study.records.found import PartialDependence, RungImportance
 
 _FOUND, _OPEN, _LIMIT, _POINTS = "#4c72b0", "0.75", "#c44e52", "0.45"
 _TREES = "middle 80 % of its trees"
 _METHODS = {"f_anova": ("f-ANOVA: share of the variance", "o"), "ped_anova": ("PED-ANOVA: share of the sum", "D")}
 
 
-def importance_chart(entries: Sequence[Mapping], title: str = "importance of hyperparameters") -> Figure:
+def importance_chart(entries: Sequence[RungImportance], title: str = "importance of hyperparameters") -> Figure:
     """Shares of the variance with intervals, found or not, and beside them two estimates without: a row a rung.
 
     Args:
-        entries: Of `cconv.study.evidence.importance.importance_by_rung`, one or more with importances; the others are
-            left out.
+        entries: One a rung, one or more with importances; the others are left out.
         title: Title of the figure.
     """
-    entries = [entry for entry in entries if entry["parameters"]]
+    entries = [entry for entry in entries if entry.parameters]
     names = _by_share(entries[0])
     with sns.axes_style("whitegrid"):
         figure = Figure(figsize=(11, max(2.6, 1.2 + 0.24 * len(names)) * len(entries) + 0.8), layout="constrained")
@@ -38,13 +39,13 @@ def importance_chart(entries: Sequence[Mapping], title: str = "importance of hyp
     return figure
 
 
-def partial_dependence_chart(dependences: Sequence[Mapping], columns: int = 3) -> Figure:
+def partial_dependence_chart(dependences: Sequence[PartialDependence], columns: int = 3) -> Figure:
     """Error against each hyperparameter: the surrogate's mean with the middle 80 % of its trees, and the raw trials.
 
     How far the trees differ is no confidence interval, and the legend says what is drawn.
 
     Args:
-        dependences: Of `cconv.study.evidence.partial_dependence.partial_dependence`, most important first.
+        dependences: One a hyperparameter, most important first.
         columns: Panels in a row.
     """
     rows = math.ceil(len(dependences) / columns)
@@ -56,65 +57,63 @@ def partial_dependence_chart(dependences: Sequence[Mapping], columns: int = 3) -
     for axes in panels[len(dependences) :]:
         axes.remove()
     for axes in panels[: len(dependences) : columns]:
-        axes.set_ylabel("validation error\n(normalized MSE)")
+        axes.set_ylabel("validation error")
     panels[0].legend(fontsize=8)
     first = dependences[0]
-    figure.suptitle(
-        f"error by hyperparameter after {first['updates']:,} updates, {first['trials']} trials\n{_quality(first)}"
-    )
+    counts = f"after {first.updates:,} updates, {first.trials} trials"
+    figure.suptitle(f"error by hyperparameter {counts}\n{_quality(first.surrogate_r2)}")
     return figure
 
 
-def _by_share(entry: Mapping) -> list[str]:
-    judged = entry["parameters"]
-    return sorted(judged, key=lambda name: -(judged[name]["share"] or 0.0))
+def _by_share(entry: RungImportance) -> list[str]:
+    judged = entry.parameters
+    return sorted(judged, key=lambda name: -(judged[name].share or 0.0))
 
 
-def _shares(axes: Axes, entry: Mapping, names: Sequence[str]) -> None:
-    tested = [(row, entry["parameters"][name]) for row, name in enumerate(names)]
-    tested = [(row, each) for row, each in tested if each["share"] is not None]
+def _shares(axes: Axes, entry: RungImportance, names: Sequence[str]) -> None:
+    tested = [(row, entry.parameters[name]) for row, name in enumerate(names)]
+    tested = [(row, each) for row, each in tested if each.share is not None]
     for decided, color, label in ((True, _FOUND, "found"), (False, _OPEN, "not found, which is not absent")):
-        rows = [row for row, each in tested if each["decided"] is decided]
-        axes.barh(rows, [each["share"] for row, each in tested if row in rows], color=color, height=0.65, label=label)
-    rows, lows, highs = zip(*((row, each["low"], each["high"]) for row, each in tested), strict=True)
+        rows = [row for row, each in tested if each.decided is decided]
+        axes.barh(rows, [each.share for row, each in tested if row in rows], color=color, height=0.65, label=label)
+    rows, lows, highs = zip(*((row, each.low, each.high) for row, each in tested), strict=True)
     axes.hlines(rows, lows, highs, color="0.15", lw=1.2, label="95 % interval of the share")
     label = "found four times in five from here on"
-    axes.axvline(entry["detectable_share"], color=_LIMIT, ls="--", lw=1.2, label=label)
+    axes.axvline(entry.detectable_share, color=_LIMIT, ls="--", lw=1.2, label=label)
     axes.set_yticks(range(len(names)), names)
     axes.grid(axis="y", visible=False)
     axes.set_title("share of the variance that it decides alone", fontsize=11)
 
 
-def _estimates(axes: Axes, entry: Mapping, names: Sequence[str]) -> None:
+def _estimates(axes: Axes, entry: RungImportance, names: Sequence[str]) -> None:
     for method, (label, marker) in _METHODS.items():
-        values = [entry["parameters"][name][method] for name in names]
+        values = [getattr(entry.parameters[name], method) for name in names]
         axes.plot(values, range(len(names)), marker, ms=5, label=label, alpha=0.8)
-    axes.set_title(f"estimates without intervals\n{_quality(entry)}", fontsize=11)
+    axes.set_title(f"estimates without intervals\n{_quality(entry.surrogate_r2)}", fontsize=11)
 
 
-def _quality(found: Mapping) -> str:
-    r2 = found["surrogate_r2"]
+def _quality(r2: float | None) -> str:
     return "all errors are equal" if r2 is None else f"surrogate's R² on unseen trials {r2:.2f}"
 
 
-def _sample(entry: Mapping) -> str:
-    left = ", those not stopped" if entry["censored"] else ""
-    return f"{entry['updates']:,} updates\n{entry['trials']} trials{left}"
+def _sample(entry: RungImportance) -> str:
+    left = ", those not stopped" if entry.censored else ""
+    return f"{entry.updates:,} updates\n{entry.trials} trials{left}"
 
 
-def _dependence(axes: Axes, dependence: Mapping) -> None:
-    choice, values = dependence["scale"] == "choice", dependence["values"]
+def _dependence(axes: Axes, dependence: PartialDependence) -> None:
+    choice, values = dependence.scale == "choice", dependence.values
     positions = list(range(len(values))) if choice else values
-    drawn = [point["value"] for point in dependence["points"]]
+    drawn = [point.value for point in dependence.points]
     x = [values.index(value) for value in drawn] if choice else drawn
-    axes.plot(x, [point["error"] for point in dependence["points"]], ".", color=_POINTS, alpha=0.6, ms=5, label="trial")
-    axes.set(yscale="log", title=dependence["parameter"], xscale="log" if dependence["scale"] == "log" else "linear")
+    axes.plot(x, [point.error for point in dependence.points], ".", color=_POINTS, alpha=0.6, ms=5, label="trial")
+    axes.set(yscale="log", title=dependence.parameter, xscale="log" if dependence.scale == "log" else "linear")
     if not choice:
-        axes.fill_between(positions, dependence["low"], dependence["high"], color=_FOUND, alpha=0.2, lw=0, label=_TREES)
-        axes.plot(positions, dependence["error"], color=_FOUND, label="surrogate", zorder=3)
+        axes.fill_between(positions, dependence.low, dependence.high, color=_FOUND, alpha=0.2, lw=0, label=_TREES)
+        axes.plot(positions, dependence.error, color=_FOUND, label="surrogate", zorder=3)
         return
-    axes.vlines(positions, dependence["low"], dependence["high"], color=_FOUND, lw=1.5, label=_TREES)
-    axes.plot(positions, dependence["error"], "o", color=_FOUND, label="surrogate", zorder=3)
+    axes.vlines(positions, dependence.low, dependence.high, color=_FOUND, lw=1.5, label=_TREES)
+    axes.plot(positions, dependence.error, "o", color=_FOUND, label="surrogate", zorder=3)
     labels = [str(value) for value in values]
     axes.set_xticks(positions, [label.replace("_to_", "_to_\n", 1) for label in labels])
     axes.tick_params(axis="x", labelsize=8)

@@ -1,7 +1,6 @@
 """The chart of a study to hover over: error against time per frame, with the hyperparameters of every point."""
 
 import math
-from collections.abc import Mapping
 
 import pandas as pd
 import plotly.graph_objects as go
@@ -10,24 +9,25 @@ import plotly.io
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, stage_colors
 from cconv.report.speed_accuracy import error_range
 from cconv.report.tables import MEAN_PREDICTOR, speed_accuracy_table
+from cconv.study.records.summary import Front, Summary
 
 _SYMBOLS = {"recommended": "star", "baseline": "square", "thesis's best": "diamond", "finalist": "circle"}
 
 
-def interactive_chart(summary: Mapping) -> go.Figure:
+def interactive_chart(summary: Summary) -> go.Figure:
     """Error against time per frame, log axes: finalists with intervals, search, front, analytic SPH.
 
     Hovering over a point shows its name, error, interval, time, parameters and all hyperparameters.
     """
     points = speed_accuracy_table(summary)
     search, finalists, analytic = (points[points["kind"] == kind] for kind in ("search", "finalist", "analytic"))
-    trivial = summary["mean_predictor"]["test"]
+    trivial = summary.mean_predictor.test
     low, high = error_range(points, trivial)
     figure = go.Figure()
     colors = stage_colors(list(search["group"].unique()))
     for stage, trials in search.groupby("group", sort=False):
         figure.add_trace(_search_trace(stage, trials, colors[stage]))
-    figure.add_traces(_attainment_traces(summary))
+    figure.add_traces(_attainment_traces(summary.front))
     figure.add_trace(_front_trace(finalists))
     figure.add_trace(_mean_predictor_trace(trivial, points["ms"].min(), points["ms"].max()))
     for group in _SYMBOLS:
@@ -37,14 +37,14 @@ def interactive_chart(summary: Mapping) -> go.Figure:
     if not analytic.empty:
         figure.add_trace(_analytic_trace(analytic, low))
     figure.update_xaxes(title="time per frame [ms]", type="log")
-    figure.update_yaxes(title="error (normalized MSE)", type="log", dtick=1, exponentformat="power")
+    figure.update_yaxes(title=f"error ({summary.task.error})", type="log", dtick=1, exponentformat="power")
     figure.update_yaxes(range=[math.log10(low), math.log10(high)])
     figure.update_layout(template="plotly_white", height=620, hovermode="closest", margin={"t": 30, "r": 20})
     figure.update_layout(legend={"orientation": "h", "y": -0.15}, hoverlabel={"align": "left"})
     return figure
 
 
-def interactive_html(summary: Mapping) -> str:
+def interactive_html(summary: Summary) -> str:
     """The chart as a piece of HTML that needs no network: plotly's program is part of it."""
     return plotly.io.to_html(
         interactive_chart(summary),
@@ -67,10 +67,8 @@ def _search_trace(stage: str, trials: pd.DataFrame, color: str) -> go.Scatter:
     )
 
 
-def _attainment_traces(summary: Mapping) -> list[go.Scatter]:
-    table = pd.DataFrame(summary.get("front", {}).get("attainment", []))
-    if table.empty:
-        return []
+def _attainment_traces(front: Front) -> list[go.Scatter]:
+    table = pd.DataFrame(map(dict, front.attainment))
     style = {"x": table["ms_per_frame"], "mode": "lines", "hoverinfo": "skip", "legendgroup": "band"}
     edge = {"color": "rgba(120,120,120,0.4)", "width": 0.5, "shape": "hv"}
     return [

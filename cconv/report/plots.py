@@ -1,6 +1,6 @@
 """Charts of a study. Each function returns a matplotlib figure of its own; showing or saving it is the caller's."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 
 import pandas as pd
 import seaborn as sns
@@ -10,20 +10,19 @@ from matplotlib.figure import Figure
 from cconv.report.colors import MARKED, MEAN_COLOR, stage_colors
 from cconv.report.tables import AUDIT_MEASURES, MEAN_PREDICTOR, growth_table, rung_audit_table, strategies_table
 from cconv.report.verdicts import verdict_matrix
+from cconv.study.declared.stage import BASELINE
+from cconv.study.records.summary import Summary
 
-_ERROR = "validation error (normalized MSE)"
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
 
 
-def learning_curves_chart(
-    curves: pd.DataFrame, baseline: str = "baseline", mean_predictor: float | None = None
-) -> Figure:
+def learning_curves_chart(curves: pd.DataFrame, summary: Summary | None = None) -> Figure:
     """Validation error against gradient updates, one line a search trial, and one for each retraining beside them.
 
     Args:
         curves: `curves_table` of a run.
-        baseline: Name of the baseline.
-        mean_predictor: Validation error of predicting the mean, drawn as a line; None where it is not known yet.
+        summary: Tells what errors are called, and that of predicting the mean, drawn as a line; None where the study
+            has not finished.
     """
     figure, (search, finals) = new_figure(11, 4.2, columns=2)
     trials, retrained = curves[~curves["retrained"]], curves[curves["stage"] == "finalists"]
@@ -33,28 +32,30 @@ def learning_curves_chart(
         search.plot(curve["updates"], curve["valid_error"], **style)
     for stage, color in stages.items():
         search.plot([], [], color=color, label=stage)
-    challengers = sorted(set(retrained["name"]) - {baseline})
+    challengers = sorted(set(retrained["name"]) - {BASELINE})
     palette = sns.color_palette("husl", len(challengers))
-    colors = {baseline: MARKED["baseline"]} | dict(zip(challengers, palette, strict=True))
+    colors = {BASELINE: MARKED["baseline"]} | dict(zip(challengers, palette, strict=True))
     for name, lines in retrained.groupby("name"):
         for number, (_, curve) in enumerate(lines.groupby("seed")):
             style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
             finals.plot(curve["updates"], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
-        axes.set(yscale="log", xlabel="gradient updates", ylabel=_ERROR, title=title)
-        mark_mean_predictor(axes.axhline, mean_predictor)
+        axes.set(yscale="log", xlabel="gradient updates", ylabel=_error_label(summary), title=title)
+        if summary is not None:
+            mark_mean_predictor(axes.axhline, summary.mean_predictor.valid)
         _legend(axes)
     return figure
 
 
-def budget_chart(curves: pd.DataFrame, finalists: Sequence[str]) -> Figure:
+def budget_chart(curves: pd.DataFrame, summary: Summary) -> Figure:
     """Validation error of every training of the finalists against gradient updates, and against training seconds.
 
     Args:
         curves: Evaluations as `curves_table` gives them.
-        finalists: Ids of the finalists, each of which has a colour.
+        summary: Names the finalists, each of which has a colour.
     """
     figure, panels = new_figure(12, 4.4, columns=2)
+    finalists = [entry.id for entry in summary.finalists]
     is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_error"].notna()
     shown = curves[is_shown]
     colors = dict(zip(finalists, sns.color_palette("husl", len(finalists)), strict=True))
@@ -63,7 +64,7 @@ def budget_chart(curves: pd.DataFrame, finalists: Sequence[str]) -> Figure:
             for number, (_, curve) in enumerate(lines.groupby("seed")):
                 style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
                 axes.plot(curve[x], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
-        axes.set(yscale="log", xlabel=label, ylabel=_ERROR)
+        axes.set(yscale="log", xlabel=label, ylabel=_error_label(summary))
     trained = shown["updates"][shown["updates"] > 0]
     panels[0].set_xscale("symlog", linthresh=trained.min() if len(trained) else 1)  # least squares takes no update
     panels[0].set(title="error against updates, one line a seed", xlim=(0, None))
@@ -72,12 +73,12 @@ def budget_chart(curves: pd.DataFrame, finalists: Sequence[str]) -> Figure:
     return figure
 
 
-def best_so_far_chart(trials: pd.DataFrame, mean_predictor: float | None = None) -> Figure:
+def best_so_far_chart(trials: pd.DataFrame, summary: Summary | None = None) -> Figure:
     """Smallest validation error found against trials begun, and each trial's error by outcome.
 
     Args:
         trials: `trials_table` of a run.
-        mean_predictor: Validation error of predicting the mean, drawn as a line; None where it is not known yet.
+        summary: As in `learning_curves_chart`.
     """
     figure, axes = new_figure(7.5, 4)
     order = range(1, len(trials) + 1)
@@ -86,24 +87,26 @@ def best_so_far_chart(trials: pd.DataFrame, mean_predictor: float | None = None)
     )
     complete = trials["valid_error"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
-    axes.set(yscale="log", xlabel="trial", ylabel="last validation error (normalized MSE)", title="search")
-    mark_mean_predictor(axes.axhline, mean_predictor)
+    axes.set(yscale="log", xlabel="trial", ylabel=f"last {_error_label(summary)}", title="search")
+    if summary is not None:
+        mark_mean_predictor(axes.axhline, summary.mean_predictor.valid)
     _legend(axes, **_BESIDE)
     return figure
 
 
-def strategies_chart(summary: Mapping) -> Figure:
+def strategies_chart(summary: Summary) -> Figure:
     """Smallest validation error against gradient updates spent, one line a search strategy."""
     figure, axes = new_figure(7.5, 4)
     for name, curve in strategies_table(summary).groupby("strategy", sort=False):
         axes.step(curve["updates"], curve["error"], where="post", marker=".", label=name)
-    axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_ERROR, title="best so far, by strategy")
-    mark_mean_predictor(axes.axhline, summary["mean_predictor"]["valid"])
+    axes.set(yscale="log", xlabel="gradient updates spent", ylabel=_error_label(summary))
+    axes.set_title("best so far, by strategy")
+    mark_mean_predictor(axes.axhline, summary.mean_predictor.valid)
     _legend(axes, **_BESIDE)
     return figure
 
 
-def rung_audit_chart(summary: Mapping) -> Figure:
+def rung_audit_chart(summary: Summary) -> Figure:
     """What the order of the trials at each rung says of the order at the full budget.
 
     The rank correlation has its 95 % interval, from twelve trials on. A rung that too few trials reached has no point.
@@ -119,10 +122,10 @@ def rung_audit_chart(summary: Mapping) -> Figure:
     return figure
 
 
-def growth_chart(summary: Mapping) -> Figure:
+def growth_chart(summary: Summary) -> Figure:
     """Time per frame against the number of particles, log axes, one line a model; bands are quartiles."""
     figure, axes = new_figure(7.5, 4.2)
-    exponents = summary["growth"].get("exponents", {})
+    exponents = summary.growth.exponents
     for name, times in growth_table(summary).groupby("model", sort=False):
         label = f"{name}: ∝ N^{exponents[name]:.2f}" if name in exponents else name
         (line,) = axes.plot(times["num_particles"], times["ms_per_frame"], marker="o", label=label)
@@ -133,12 +136,12 @@ def growth_chart(summary: Mapping) -> Figure:
     return figure
 
 
-def cost_chart(summary: Mapping) -> Figure:
+def cost_chart(summary: Summary) -> Figure:
     """Time per frame of each finalist, geometry and network apart, fastest first."""
-    costs = {entry["id"]: entry["cost"] for entry in summary["finalists"]}
-    names = sorted(costs, key=lambda name: costs[name]["ms_per_frame"])
+    costs = {entry.id: entry.cost for entry in summary.finalists}
+    names = sorted(costs, key=lambda name: costs[name].ms_per_frame)
     figure, axes = new_figure(8, 1.4 + 0.36 * len(names))
-    geometry, network = ([costs[name][part] for name in names] for part in ("geometry_ms", "network_ms"))
+    geometry, network = zip(*((costs[name].geometry_ms, costs[name].network_ms) for name in names), strict=True)
     axes.barh(names, geometry, color="0.7", label="geometry")
     axes.barh(names, network, left=geometry, color=MARKED["finalist"], label="network")
     axes.invert_yaxis()
@@ -147,47 +150,44 @@ def cost_chart(summary: Mapping) -> Figure:
     return figure
 
 
-def stability_chart(summary: Mapping) -> Figure:
+def stability_chart(summary: Summary) -> Figure:
     """Each finding of the checks of stability by its limit, log axis: left of the line at 1 a finalist passes."""
-    findings = [row for row in verdict_matrix(summary) if row.limit is not None]
-    names = [entry["id"] for entry in summary["finalists"]]
-    figure, axes = new_figure(9, 1.6 + 0.3 * len(findings))
-    for number, name in enumerate(names):
-        places = [place for place, row in enumerate(findings) if row.cells[number].value is not None]
-        ratios = [findings[place].cells[number].value / findings[place].limit for place in places]
-        axes.plot(ratios, places, "o", alpha=0.8, label=name)
+    rows = verdict_matrix(summary)
+    places = range(len(rows))
+    figure, axes = new_figure(9, 1.6 + 0.3 * len(rows))
+    for number, entry in enumerate(summary.finalists):
+        axes.plot([row.cells[number].value / row.limit for row in rows], places, "o", alpha=0.8, label=entry.id)
     axes.axvline(1, color=MARKED["baseline"], lw=1.2)
-    axes.set_yticks(range(len(findings)), [f"{row.check}: {row.label}" for row in findings])
+    axes.set_yticks(places, [f"{row.check}: {row.label}" for row in rows])
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="measured by limit", title="checks of stability")
     _legend(axes)
     return figure
 
 
-def ablation_chart(summary: Mapping) -> Figure:
+def ablation_chart(summary: Summary) -> Figure:
     """Validation error on the way from the baseline to the best, one change after the other, each retrained."""
-    path = pd.DataFrame(summary["ablation"]["path"]).astype({"valid_error": float, "low": float, "high": float})
+    path = pd.DataFrame(map(dict, summary.ablation.path))
     figure, axes = new_figure(8, 1.2 + 0.38 * len(path))
     error, low, high = (path[name].astype(float) for name in ("valid_error", "low", "high"))
     places, bars = range(len(path)), [(error - low).clip(lower=0), (high - error).clip(lower=0)]
     axes.errorbar(error, places, xerr=bars, fmt="o-", capsize=3, color=MARKED["finalist"])
     axes.set_yticks(places, [str(change) for change in path["change"]])
     axes.invert_yaxis()
-    axes.set(xscale="log", xlabel=_ERROR, title="from the baseline to the best")
-    mark_mean_predictor(axes.axvline, summary["mean_predictor"]["valid"])
+    axes.set(xscale="log", xlabel=_error_label(summary), title="from the baseline to the best")
+    mark_mean_predictor(axes.axvline, summary.mean_predictor.valid)
     _legend(axes)
     return figure
 
 
-def mark_mean_predictor(draw_line: Callable, error: float | None) -> None:
+def mark_mean_predictor(draw_line: Callable, error: float) -> None:
     """Draw what a model must be below to know anything: the error of predicting the mean on the split of the chart.
 
     Args:
         draw_line: `axhline` or `axvline` of the axes.
-        error: That error; None draws nothing.
+        error: That error.
     """
-    if error is not None:
-        draw_line(error, color=MEAN_COLOR, lw=1.2, ls="--", label=f"{MEAN_PREDICTOR}: {error:.3g}")
+    draw_line(error, color=MEAN_COLOR, lw=1.2, ls="--", label=f"{MEAN_PREDICTOR}: {error:.3g}")
 
 
 def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Axes]:
@@ -195,6 +195,10 @@ def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, A
     with sns.axes_style("whitegrid"):
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.subplots(1, columns)
+
+
+def _error_label(summary: Summary | None) -> str:
+    return "validation error" if summary is None else f"validation error ({summary.task.error})"
 
 
 def _legend(axes: Axes, **place) -> None:

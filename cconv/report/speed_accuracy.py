@@ -3,8 +3,6 @@
 Finalists stand out, with intervals; trials and closed forms of the search are small and faded.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 import pandas as pd
 import seaborn as sns
@@ -15,11 +13,12 @@ from matplotlib.ticker import LogFormatter
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
 from cconv.report.plots import mark_mean_predictor
 from cconv.report.tables import ANALYTIC, speed_accuracy_table
+from cconv.study.records.summary import Summary
 
 _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
 
 
-def speed_accuracy_chart(summary: Mapping) -> Figure:
+def speed_accuracy_chart(summary: Summary) -> Figure:
     """Error against time per frame, log axes: finalists, search, front, analytic SPH.
 
     Vertical bars are 95 % intervals over seeds and test units, where there are enough for one; horizontal bars are the
@@ -32,20 +31,20 @@ def speed_accuracy_chart(summary: Mapping) -> Figure:
     with sns.axes_style("whitegrid"):
         figure = Figure(figsize=(10.5, max(5.5, 0.42 * len(finalists))), layout="constrained")
         axes = figure.subplots()
-    axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel="error (normalized MSE)")
+    axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel=f"error ({summary.task.error})")
     _draw_search(axes, points[points["kind"] == "search"])
     _draw_front(axes, summary, finalists)
     for row in finalists.itertuples():
         _draw_finalist(axes, row)
-    trivial = summary["mean_predictor"]["test"]
+    trivial = summary.mean_predictor.test
     axes.set_ylim(*error_range(points, trivial))
     mark_mean_predictor(axes.axhline, trivial)
     _draw_analytic(axes, points[points["kind"] == "analytic"])
     _name_in_margin(axes, finalists)
     for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         which(LogFormatter(minor_thresholds=(1.5, 0.6)))
-    threads = summary["finalists"][0]["cost"]["threads"]
-    axes.set_title(f"{summary['study']}: error against cost ({threads} thread{'s' * (threads > 1)})")
+    threads = summary.finalists[0].cost.threads
+    axes.set_title(f"{summary.study}: error against cost ({threads} thread{'s' * (threads > 1)})")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     return figure
 
@@ -71,15 +70,12 @@ def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
         axes.scatter([], [], s=16, facecolors="none", edgecolors="0.5", label="stopped early")
 
 
-def _draw_front(axes: Axes, summary: Mapping, finalists: pd.DataFrame) -> None:
+def _draw_front(axes: Axes, summary: Summary, finalists: pd.DataFrame) -> None:
     front = finalists[finalists["on_front"]].sort_values("ms")
     axes.step(front["ms"], front["error"], where="post", color="0.35", lw=1.2, zorder=3, label="front by validation")
-    attainment = pd.DataFrame(summary.get("front", {}).get("attainment", []))
-    if not attainment.empty:
-        ms, low, high = (attainment[name].astype(float) for name in ("ms_per_frame", "low", "high"))
-        axes.fill_between(
-            ms, low, high, step="post", color="0.5", alpha=0.2, lw=0, label="front, 8 of 10 draws of a seed each"
-        )
+    ms, low, high = zip(*((step.ms_per_frame, step.low, step.high) for step in summary.front.attainment), strict=True)
+    band = {"color": "0.5", "alpha": 0.2, "lw": 0, "label": "front, 8 of 10 draws of a seed each"}
+    axes.fill_between(ms, low, high, step="post", **band)
 
 
 def _draw_finalist(axes: Axes, row) -> None:

@@ -1,11 +1,13 @@
 """A run folder as tidy tables. Reads our records only; neither Ray nor torch is imported."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import pandas as pd
 
+from cconv.study.records.found import RungImportance
 from cconv.study.records.run_folder import RunFolder
+from cconv.study.records.summary import FinalistEntry, Summary
 
 ANALYTIC = "analytic SPH"
 MEAN_PREDICTOR = "predicting the mean"  # of the training split, always and everywhere
@@ -51,40 +53,52 @@ def curves_table(run: RunFolder) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def finalists_table(summary: Mapping) -> pd.DataFrame:
+def finalists_table(summary: Summary) -> pd.DataFrame:
     """One row a finalist: errors with the interval of the test error, cost, parameters; most accurate first.
 
     Two rows say what the errors and times mean: predicting the mean of the training split, and analytic SPH. Intervals
     are empty where there are too few seeds or units for one.
     """
     rows = _reference_rows(summary)
-    for entry in summary["finalists"]:
-        low, high = entry["test"]["ci95"] or (math.nan, math.nan)
+    for entry in summary.finalists:
+        low, high = entry.test.ci95 or (math.nan, math.nan)
         rows.append(
             {
-                "model": entry["id"],
-                "valid_error": entry["valid"]["normalized_mse"],
-                "normalized_mse": entry["test"]["normalized_mse"],
+                "model": entry.id,
+                "valid_error": entry.valid.normalized_mse,
+                "normalized_mse": entry.test.normalized_mse,
                 "ci95_low": low,
                 "ci95_high": high,
-                "relative_rmse": entry["test"]["relative_rmse"],
-                "per_frame_normalized_mse": entry["test"]["per_frame_normalized_mse"],
-                "ms_per_frame": entry["cost"]["ms_per_frame"],
-                "ms_low": entry["cost"]["ms_low"],
-                "ms_high": entry["cost"]["ms_high"],
-                "us_per_particle": entry["cost"]["us_per_particle"],
-                "peak_mb": entry["cost"]["peak_mb"],
-                "flops_per_particle": entry["cost"]["flops_per_particle"],
-                "num_parameters": entry["num_parameters"],
-                "stable": entry["stability"]["stable"] if entry["stability"] else None,
-                "train_seconds": entry["train_seconds"],
-                **entry["config"]["parameters"],
+                "relative_rmse": entry.test.relative_rmse,
+                "per_frame_normalized_mse": entry.test.per_frame_normalized_mse,
+                "ms_per_frame": entry.cost.ms_per_frame,
+                "ms_low": entry.cost.ms_low,
+                "ms_high": entry.cost.ms_high,
+                "us_per_particle": entry.cost.us_per_particle,
+                "peak_mb": entry.cost.peak_mb,
+                "flops_per_particle": entry.cost.flops_per_particle,
+                "num_parameters": entry.num_parameters,
+                "stable": entry.stability.stable,
+                "train_seconds": entry.train_seconds,
+                **entry.config.parameters,
             }
         )
     return pd.DataFrame(rows).sort_values("normalized_mse", ignore_index=True)
 
 
-def speed_accuracy_table(summary: Mapping) -> pd.DataFrame:
+def finalists_rows(summary: Summary) -> list[dict]:
+    """Rows of `finalists_table`, each with whether it is on the front, and with its finalist as "entry".
+
+    The rows of the mean predictor and of analytic SPH have None there.
+    """
+    rows = finalists_table(summary).to_dict("records")
+    return [
+        row | {"on_front": row["model"] in summary.pareto_front, "entry": summary.finalist(row["model"])}
+        for row in rows
+    ]
+
+
+def speed_accuracy_table(summary: Summary) -> pd.DataFrame:
     """One row a point of the speed-accuracy chart.
 
     Columns: name; kind ("finalist", "search" or "analytic"); group, the stage of a search point or what marks a
@@ -92,117 +106,114 @@ def speed_accuracy_table(summary: Mapping) -> pd.DataFrame:
     for finalists, of the validation split for search points, 0 for analytic SPH; the interval is empty where there are
     too few seeds or units for one); ms, ms_low, ms_high per frame; measured, whether the time was measured or
     estimated; num_parameters; outcome; on_front, by validation errors; hyperparameters, a dict.
-    Search points without an error or a time are left out.
     """
     rows = [*_finalist_points(summary), *_search_points(summary)]
-    analytic = summary.get("analytic")
+    analytic = summary.analytic
     if analytic:
-        times = {"ms": analytic["ms_per_frame"], "ms_low": analytic["ms_low"], "ms_high": analytic["ms_high"]}
+        times = {"ms": analytic.ms_per_frame, "ms_low": analytic.ms_low, "ms_high": analytic.ms_high}
         rows.append({"name": ANALYTIC, "kind": "analytic", "group": ANALYTIC, "error": 0.0} | times)
     defaults = {"measured": True, "outcome": "completed", "on_front": False}
     return pd.DataFrame([defaults | row for row in rows])
 
 
-def growth_table(summary: Mapping) -> pd.DataFrame:
+def growth_table(summary: Summary) -> pd.DataFrame:
     """One row a model and number of particles: time per frame with quartiles, and its two parts, in ms."""
-    models = summary.get("growth", {}).get("models", {})
-    return pd.DataFrame([{"model": name, **entry} for name, entries in models.items() for entry in entries])
+    models = summary.growth.models
+    return pd.DataFrame([{"model": name, **dict(size)} for name, sizes in models.items() for size in sizes])
 
 
-def strategies_table(summary: Mapping) -> pd.DataFrame:
+def strategies_table(summary: Summary) -> pd.DataFrame:
     """One row a point of the best-so-far curve of each search strategy: strategy, updates spent, error."""
-    strategies = summary.get("references", {}).get("strategies", {})
     rows = [
         {"strategy": name, "updates": updates, "error": error}
-        for name, strategy in strategies.items()
-        for updates, error in strategy["curve"]
+        for name, strategy in summary.references.strategies.items()
+        for updates, error in strategy.curve
     ]
     return pd.DataFrame(rows)
 
 
-def rung_audit_table(summary: Mapping) -> pd.DataFrame:
+def rung_audit_table(summary: Summary) -> pd.DataFrame:
     """One row a rung: updates, trials, the measures of the audit, the correlation's interval or why none, the verdict.
 
     Measures of a rung that too few trials reached are empty.
     """
     rows = []
-    for rung in summary.get("rung_audit", []):
-        low, high = rung["spearman_ci95"] or (math.nan, math.nan)
+    for rung in summary.rung_audit:
+        low, high = rung.spearman_ci95 or (math.nan, math.nan)
         rows.append(
             {
-                "updates": rung["updates"],
-                "trials": rung["trials"],
-                **{name: rung[name] for name in AUDIT_MEASURES},
+                "updates": rung.updates,
+                "trials": rung.trials,
+                **{name: getattr(rung, name) for name in AUDIT_MEASURES},
                 "spearman_low": low,
                 "spearman_high": high,
-                "why_no_interval": rung["why_no_interval"],
-                "verdict": rung["verdict"],
+                "why_no_interval": rung.why_no_interval,
+                "verdict": rung.verdict,
             }
         )
     return pd.DataFrame(rows)
 
 
-def importance_table(summary: Mapping) -> pd.DataFrame:
+def importance_table(importance: Sequence[RungImportance]) -> pd.DataFrame:
     """One row a rung and hyperparameter, the largest share first; rungs without importances are left out.
 
     Columns: updates; hyperparameter; share of the variance with its 95 % interval from low to high; p_value, adjusted
     for the number of hyperparameters; decided; f_anova and ped_anova, which have no interval.
     """
     rows = [
-        {"updates": entry["updates"], "hyperparameter": name, **each}
-        for entry in summary.get("importance", [])
-        for name, each in sorted(entry["parameters"].items(), key=lambda item: -(item[1]["share"] or 0.0))
+        {"updates": entry.updates, "hyperparameter": name, **dict(each)}
+        for entry in importance
+        for name, each in sorted(entry.parameters.items(), key=lambda item: -(item[1].share or 0.0))
     ]
     return pd.DataFrame(rows)
 
 
-def _reference_rows(summary: Mapping) -> list[dict]:
-    trivial, analytic = summary["mean_predictor"], summary.get("analytic")
-    row = {"model": MEAN_PREDICTOR, "valid_error": trivial["valid"], "normalized_mse": trivial["test"]}
-    rows = [row | {"relative_rmse": math.sqrt(trivial["test"])}]
+def _reference_rows(summary: Summary) -> list[dict]:
+    mean, analytic = summary.mean_predictor, summary.analytic
+    row = {"model": MEAN_PREDICTOR, "valid_error": mean.valid, "normalized_mse": mean.test}
+    rows = [row | {"relative_rmse": math.sqrt(mean.test)}]
     if analytic:
         exact = dict.fromkeys(("valid_error", "normalized_mse", "relative_rmse"), 0.0)
-        times = {name: analytic[name] for name in ("ms_per_frame", "ms_low", "ms_high")}
+        times = {name: getattr(analytic, name) for name in ("ms_per_frame", "ms_low", "ms_high")}
         rows.append({"model": ANALYTIC} | exact | times)
     return rows
 
 
-def _finalist_points(summary: Mapping) -> list[dict]:
-    marks = {"thesis_best": "thesis's best", summary["baseline"]: "baseline"}
-    marks[summary["recommended"]["id"]] = "recommended"
-    front = set(summary["pareto_front"])
-    return [
-        {
-            "name": entry["id"],
-            "kind": "finalist",
-            "group": marks.get(entry["id"], "finalist"),
-            "error": entry["test"]["normalized_mse"],
-            "error_low": (entry["test"]["ci95"] or (math.nan, math.nan))[0],
-            "error_high": (entry["test"]["ci95"] or (math.nan, math.nan))[1],
-            "ms": entry["cost"]["ms_per_frame"],
-            "ms_low": entry["cost"]["ms_low"],
-            "ms_high": entry["cost"]["ms_high"],
-            "num_parameters": entry["num_parameters"],
-            "on_front": entry["id"] in front,
-            "hyperparameters": entry["config"]["parameters"],
-        }
-        for entry in summary["finalists"]
-    ]
+def _finalist_points(summary: Summary) -> list[dict]:
+    marks = {"thesis_best": "thesis's best", summary.baseline: "baseline", summary.recommended.id: "recommended"}
+    return [_finalist_point(entry, summary, marks.get(entry.id, "finalist")) for entry in summary.finalists]
 
 
-def _search_points(summary: Mapping) -> list[dict]:
+def _finalist_point(entry: FinalistEntry, summary: Summary, group: str) -> dict:
+    low, high = entry.test.ci95 or (math.nan, math.nan)
+    return {
+        "name": entry.id,
+        "kind": "finalist",
+        "group": group,
+        "error": entry.test.normalized_mse,
+        "error_low": low,
+        "error_high": high,
+        "ms": entry.cost.ms_per_frame,
+        "ms_low": entry.cost.ms_low,
+        "ms_high": entry.cost.ms_high,
+        "num_parameters": entry.num_parameters,
+        "on_front": entry.id in summary.pareto_front,
+        "hyperparameters": entry.config.parameters,
+    }
+
+
+def _search_points(summary: Summary) -> list[dict]:
     return [
         {
-            "name": point["id"],
+            "name": point.id,
             "kind": "search",
-            "group": point["stage"],
-            "error": point["valid_error"],
-            "ms": point["ms_per_frame"],
-            "measured": point["measured"],
-            "num_parameters": point["num_parameters"],
-            "outcome": point["outcome"],
-            "hyperparameters": point["parameters"],
+            "group": point.stage,
+            "error": point.valid_error,
+            "ms": point.ms_per_frame,
+            "measured": point.measured,
+            "num_parameters": point.num_parameters,
+            "outcome": point.outcome,
+            "hyperparameters": point.parameters,
         }
-        for point in summary.get("search_points", [])
-        if point["valid_error"] is not None and point["ms_per_frame"] is not None
+        for point in summary.search_points
     ]

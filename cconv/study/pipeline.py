@@ -14,6 +14,7 @@ from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
 from cconv.study.records.run_folder import FORMAT, RunFolder
+from cconv.study.records.summary import Summary
 from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import database_answers, open_mirror
@@ -45,7 +46,7 @@ def run_study(
     address: str | None = None,
     storage: str | None = None,
     serial: bool = False,
-) -> dict | None:
+) -> Summary | None:
     """Run the stages of a study that have not come to their end; every result is on disk before the next begins.
 
     Args:
@@ -57,7 +58,7 @@ def run_study(
         serial: Whether to train one configuration after another in this process, without Ray.
 
     Returns:
-        The summary, as it stands in summary.json; None if no stage selects.
+        The summary; None if no stage selects.
 
     Raises:
         ConfigError: If another run works in the folder, or a stage cannot go on.
@@ -79,7 +80,7 @@ def run_study(
             run.set_state("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", stage)
             raise
         run.set_state("finished", stage)
-    return run.read("summary.json") if (run.path / "summary.json").is_file() else None
+    return run.summary() if run.has_summary else None
 
 
 def extend_study(run: RunFolder, stage: str, trials: int) -> None:
@@ -122,8 +123,8 @@ def write_study(run: RunFolder, study: StudyConfig) -> None:
 
 def _run_stage(session: Session, name: str, stage: Stage) -> None:
     start = time.perf_counter()
-    result = stage.run(session, name)
-    session.run.write(f"stages/{name}.json", {"kind": stage.kind, "seconds": time.perf_counter() - start, **result})
+    found = stage.run(session, name)
+    session.run.write_result(name, stage.kind, time.perf_counter() - start, found)
 
 
 @contextmanager

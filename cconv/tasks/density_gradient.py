@@ -14,6 +14,10 @@ class DensityGradient(FieldTask):
 
     name = "density_gradient"
     symbol = "∇ρ"
+    meaning = (
+        "The gradient of the density at each particle, as a sum over its neighbours in smoothed particle hydrodynamics "
+        "(SPH)."
+    )
     output = Kinds(0, 1)
     checks = ("regimes", "stress", "precision")
 

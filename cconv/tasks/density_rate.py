@@ -14,6 +14,10 @@ class DensityRate(FieldTask):
 
     name = "density_rate"
     symbol = "Dρ/Dt"
+    meaning = (
+        "The rate at which the density of each particle changes, as a sum over its neighbours in smoothed particle "
+        "hydrodynamics (SPH)."
+    )
     output = Kinds(1, 0)
     checks = ("regimes", "stress", "still", "precision", "density")
 

@@ -26,7 +26,8 @@ class FieldTask(ABC):
 
     name: ClassVar[str]
     symbol: ClassVar[str]  # of the field, for charts
-    objective: ClassVar[str] = "normalized_mse"  # what models are compared by, of `evaluation.objectives`
+    meaning: ClassVar[str]  # of the field, a sentence for readers
+    objective: ClassVar[str] = "normalized_mse"  # what models are compared by, of `cconv.evaluation.objectives`
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
     optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without

@@ -71,7 +71,7 @@ def hypervolume_of_the_front(rng, shape, spreads) -> Simulated:
         for name, typical in TYPICAL.items()
     }
     truth = hypervolume(((TYPICAL[name], COSTS[name]) for name in TYPICAL), CORNER)
-    return Simulated(hypervolume_interval(tables, COSTS, CORNER)["ci95"], truth)
+    return Simulated(hypervolume_interval(tables, COSTS, CORNER).ci95, truth)
 
 
 INTERVALS: dict[str, Callable[..., Simulated]] = {

@@ -1,14 +1,12 @@
 """Charts show what the tables hold, and labels do not cover each other."""
 
 import itertools
-import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from summaries import explanation, whole_summary
+from summaries import SAMPLE, changed, explanation, whole_summary
 
 from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
 from cconv.report.interactive import interactive_chart, interactive_html
@@ -27,8 +25,6 @@ from cconv.report.speed_accuracy import error_range, speed_accuracy_chart, sprea
 from cconv.report.tables import ANALYTIC, curves_table, speed_accuracy_table, trials_table
 from cconv.study.records.run_folder import RunFolder
 
-SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
-
 
 @pytest.fixture
 def run():
@@ -37,24 +33,21 @@ def run():
 
 @pytest.fixture
 def summary():
-    return whole_summary(json.loads((SAMPLE / "summary.json").read_text()))
+    return whole_summary(RunFolder(SAMPLE).summary())
 
 
 def crowded(summary, count):
     """The summary with `count` finalists of nearly the same error and time."""
-    first = summary["finalists"][0]
-    others = [
-        json.loads(json.dumps(first)) | {"id": f"copy_{number}", "num_parameters": number} for number in range(count)
-    ]
-    return summary | {"finalists": [*summary["finalists"], *others]}
+    copies = [changed(summary.finalists[0], id=f"copy_{number}", num_parameters=number) for number in range(count)]
+    return changed(summary, finalists=[*summary.finalists, *copies])
 
 
 def test_static_chart_has_log_axes_every_finalist_and_the_front(summary):
     (axes,) = speed_accuracy_chart(summary).axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     labels = " ".join(text.get_text() for text in axes.texts)
-    assert all(entry["id"] in labels for entry in summary["finalists"])
-    assert {"front by validation", "predicting the mean: 1.58", "random", "second look"} <= set(
+    assert all(entry.id in labels for entry in summary.finalists)
+    assert {"front by validation", "predicting the mean: 1.58", "random", "second_look"} <= set(
         axes.get_legend_handles_labels()[1]
     )
     assert ANALYTIC in labels
@@ -65,7 +58,7 @@ def test_names_in_the_static_chart_do_not_overlap(summary, copies):
     figure = speed_accuracy_chart(crowded(summary, copies))
     figure.draw_without_rendering()
     names = [text for text in figure.axes[0].texts if "parameters" in text.get_text()]
-    assert len(names) == len(summary["finalists"]) + copies
+    assert len(names) == len(summary.finalists) + copies
     boxes = [Text.get_window_extent(text) for text in names]  # without the lines to the points
     assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
 
@@ -79,8 +72,8 @@ def test_heights_keep_order_gap_and_range():
 
 
 def test_the_error_axis_shows_all_finalists_and_not_what_diverged(summary):
-    summary["search_points"][0]["valid_error"] = 1e9
-    points = speed_accuracy_table(summary)
+    far = changed(summary.search_points[0], valid_error=1e9)
+    points = speed_accuracy_table(changed(summary, search_points=[*summary.search_points, far]))
     low, high = error_range(points, 1.58)
     finalists = points[points["kind"] == "finalist"]
     assert low < finalists["error_low"].min()
@@ -95,8 +88,8 @@ def test_interactive_chart_shows_every_point_with_its_hyperparameters(summary):
     assert len(texts) == len(points)
     for name, count in points["name"].value_counts().items():  # a finalist bears the name of the trial that found it
         assert sum(f"<b>{name}</b>" in text for text in texts) == count
-    entries = [*summary["search_points"], *(entry["config"] | {"id": entry["id"]} for entry in summary["finalists"])]
-    parameters = {entry["id"]: entry["parameters"] for entry in entries}
+    parameters = {point.id: point.parameters for point in summary.search_points}
+    parameters |= {entry.id: entry.config.parameters for entry in summary.finalists}
     for text in texts:
         name = re.match("<b>(.*?)</b>", text)[1]
         assert "ms per frame" in text
@@ -106,25 +99,26 @@ def test_interactive_chart_shows_every_point_with_its_hyperparameters(summary):
 
 def test_stopped_trials_are_hollow_and_finalists_have_intervals(summary):
     traces = {trace.name: trace for trace in interactive_chart(summary).data}
-    outcomes = [point["outcome"] for point in summary["search_points"] if point["stage"] == "random"]
+    outcomes = [point.outcome for point in summary.search_points if point.stage == "random"]
     assert [symbol == "circle" for symbol in traces["random (search)"].marker.symbol] == [
         outcome == "completed" for outcome in outcomes
     ]
     chosen = traces["recommended"]
     assert chosen.marker.symbol == "star"
-    entry = next(each for each in summary["finalists"] if each["id"] == summary["recommended"]["id"])
-    assert chosen.y[0] + chosen.error_y.array[0] == pytest.approx(entry["test"]["ci95"][1])
-    assert chosen.y[0] - chosen.error_y.arrayminus[0] == pytest.approx(entry["test"]["ci95"][0])
+    low, high = summary.chosen.test.ci95
+    assert chosen.y[0] + chosen.error_y.array[0] == pytest.approx(high)
+    assert chosen.y[0] - chosen.error_y.arrayminus[0] == pytest.approx(low)
 
 
 def test_a_finalist_without_an_interval_has_no_vertical_bars(summary):
-    entry = next(each for each in summary["finalists"] if each["id"] == summary["recommended"]["id"])
-    entry["test"]["ci95"] = None
+    without = changed(summary.chosen, test=changed(summary.chosen.test, ci95=None))
+    others = [entry for entry in summary.finalists if entry.id != summary.chosen.id]
+    summary = changed(summary, finalists=[without, *others])
     chosen = {trace.name: trace for trace in interactive_chart(summary).data}["recommended"]
     assert np.isnan(chosen.error_y.array).all()
     assert "95 %" not in chosen.hovertext[0]
     bars = [len(container.lines[2]) for container in speed_accuracy_chart(summary).axes[0].containers]
-    assert sorted(bars) == [1, *[2] * (len(summary["finalists"]) - 1)]
+    assert sorted(bars) == [1, *[2] * (len(summary.finalists) - 1)]
 
 
 def lines_at(axes, value, get):
@@ -139,8 +133,8 @@ def test_every_chart_of_errors_shows_the_mean_predictors_own(run, summary):
     drawn = {trace.name: trace for trace in interactive_chart(summary).data}["predicting the mean: 1.58"]
     assert set(drawn.y) == {1.58}
     validated = [
-        *learning_curves_chart(curves_table(run), mean_predictor=4.5).axes,
-        *best_so_far_chart(trials_table(run), 4.5).axes,
+        *learning_curves_chart(curves_table(run), summary).axes,
+        *best_so_far_chart(trials_table(run), summary).axes,
         *strategies_chart(summary).axes,
     ]
     assert [len(lines_at(axes, 4.5, "get_ydata")) for axes in validated] == [1, 1, 1, 1]
@@ -162,15 +156,15 @@ def test_charts_of_the_search_show_the_trials(run):
 
 
 def test_the_chart_of_budgets_has_a_line_for_each_seed_of_each_finalist(run, summary):
-    ids = [entry["id"] for entry in summary["finalists"]]
-    updates, seconds = budget_chart(curves_table(run), ids).axes
+    ids = [entry.id for entry in summary.finalists]
+    updates, seconds = budget_chart(curves_table(run), summary).axes
     trained = sum(len(records) for name, records in run.retrainings().items() if name in ids)
     assert len(updates.lines) == len(seconds.lines) == trained
     assert [text.get_text() for text in seconds.get_legend().get_texts()] == sorted(ids)
 
 
 def test_other_charts_show_their_records(summary):
-    assert len(growth_chart(summary).axes[0].lines) == len(summary["finalists"])
+    assert len(growth_chart(summary).axes[0].lines) == len(summary.finalists)
     assert len(strategies_chart(summary).axes[0].lines) == 2 + 1  # that of the mean predictor
     assert [axes.get_title() for axes in rung_audit_chart(summary).axes] == [
         "rank correlation",
@@ -179,12 +173,12 @@ def test_other_charts_show_their_records(summary):
     ]
     assert [len(axes.collections) for axes in rung_audit_chart(summary).axes] == [1, 0, 0]  # intervals of one measure
     labels = [label.get_text() for label in ablation_chart(summary).axes[0].get_yticklabels()]
-    assert labels == ["baseline", "lost", "layers: 2"]
+    assert labels == ["baseline", "lost", "network.layers"]
 
 
 def test_cost_chart_adds_geometry_and_network_fastest_first(summary):
     (axes,) = cost_chart(summary).axes
-    times = [entry["cost"]["geometry_ms"] + entry["cost"]["network_ms"] for entry in summary["finalists"]]
+    times = [entry.cost.geometry_ms + entry.cost.network_ms for entry in summary.finalists]
     geometry, network = axes.containers
     ends = [bar.get_x() + bar.get_width() for bar in network]
     assert ends == pytest.approx(sorted(times), rel=1e-6)
@@ -196,21 +190,21 @@ def test_points_right_of_the_line_are_the_checks_that_failed(summary):
     *finalists, limit = axes.lines
     assert set(limit.get_xdata()) == {1}
     failed = [bool((line.get_xdata() > 1).any()) for line in finalists]
-    assert failed == [not entry["stability"]["stable"] for entry in summary["finalists"]]
+    assert failed == [not entry.stability.stable for entry in summary.finalists]
 
 
 @pytest.mark.parametrize(("dim", "components"), [(1, 1), (2, 1), (2, 2), (3, 1), (3, 3)])
 def test_what_was_learned_is_drawn_in_all_dimensions(dim, components):
     arrays = explanation(dim, components)
     assert len(filters_chart(arrays).axes) == dim + 1
-    titles = [axes.get_title() for axes in fields_chart(arrays).axes]
-    assert titles[0].startswith("analytic")
-    assert titles[1].startswith("predicted")
+    titles = [axes.get_title() for axes in fields_chart(arrays, "q").axes]
+    symbol = "q" if components == 1 else "|q|"
+    assert titles[:2] == [f"analytic {symbol}", f"predicted {symbol}"]
 
 
 def test_space_is_drawn_as_a_slice_of_two_spacings():
     arrays = explanation(3, particles=500)
-    drawn = fields_chart(arrays).axes[0].collections[0].get_offsets()
+    drawn = fields_chart(arrays, "q").axes[0].collections[0].get_offsets()
     depth = arrays["positions"][:, 2]
     assert len(drawn) == (abs(depth - np.median(depth)) <= 0.1).sum() < 500
 
@@ -225,10 +219,9 @@ def test_error_distribution_has_the_models_that_were_explained():
 
 def test_explanations_are_read_by_name_and_never_unpickled(tmp_path):
     run = RunFolder(tmp_path)
-    assert read_explanations(run) == {}
     (tmp_path / "explanation").mkdir()
     np.savez(tmp_path / "explanation" / "best.npz", **explanation())
-    assert str(read_explanations(run)["best"]["task"]) == "density_rate"
+    assert float(read_explanations(run, ["best"])["best"]["cutoff"]) == 0.2
     np.savez(tmp_path / "explanation" / "evil.npz", harm=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="allow_pickle"):
-        read_explanations(run)
+        read_explanations(run, ["evil"])

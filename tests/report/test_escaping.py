@@ -1,13 +1,11 @@
 """Strings from files of others stand in the report as text, never as HTML or script."""
 
-import copy
 import json
 import shutil
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
-from summaries import whole_summary
+from summaries import SAMPLE, changed, whole_summary
 
 from cconv.errors import DataError
 from cconv.report.fields import read_explanations
@@ -16,7 +14,6 @@ from cconv.study.records.run_folder import RunFolder
 
 pytestmark = pytest.mark.integration
 
-SAMPLE = Path(__file__).parents[2] / "analysis" / "sample_run"
 HOSTILE = "</script></style><img src=x onerror=evil()><script>evil()</script>\"'&"
 
 
@@ -39,28 +36,38 @@ class Elements(HTMLParser):
 
 
 def hostile(summary):
-    """A summary whose free texts, and hyperparameters that are texts, are all hostile."""
-    summary = copy.deepcopy(summary)
-    summary["recommended"]["reason"] = f"{HOSTILE}. {HOSTILE}"
-    summary["refined"] = {HOSTILE: HOSTILE}
-    summary["failed_finalists"] = {HOSTILE: HOSTILE}
-    summary["selection"]["rule"] = HOSTILE
-    summary["checks"] = dict.fromkeys(summary["checks"], HOSTILE)
-    for row in summary["selection"]["comparisons"]:
-        row["why_not"] = HOSTILE
-    for entry in summary["finalists"]:
-        entry["config"]["parameters"] |= {"window": HOSTILE, HOSTILE: HOSTILE}
-        entry["stability"]["failures"] = [HOSTILE]
-        entry["stability"]["findings"][0] |= {"label": HOSTILE, "detail": HOSTILE}
-    for point in summary["search_points"]:
-        point["parameters"] = {"window": HOSTILE, HOSTILE: 1}
-    return summary
+    """A summary whose free texts, and hyperparameters that are texts, are all hostile; names cannot be."""
+    hidden = {"window": HOSTILE, HOSTILE: 1}
+    findings = [changed(each, label=HOSTILE, detail=HOSTILE) for each in summary.chosen.stability.findings]
+    comparisons = [changed(row, why_not=HOSTILE) for row in summary.selection.comparisons]
+    finalists = [
+        changed(
+            entry,
+            config=changed(entry.config, parameters=entry.config.parameters | hidden),
+            stability=changed(entry.stability, failures=[HOSTILE], findings=findings),
+        )
+        for entry in summary.finalists
+    ]
+    task = dict.fromkeys(("symbol", "meaning", "error", "error_meaning"), HOSTILE)
+    return changed(
+        summary,
+        checks=dict.fromkeys(summary.checks, HOSTILE),
+        task=changed(summary.task, **task),
+        recommended=changed(summary.recommended, reason=f"{HOSTILE}. {HOSTILE}"),
+        refined={HOSTILE: HOSTILE},
+        failed_finalists={"lost": HOSTILE},
+        selection=changed(summary.selection, comparisons=comparisons),
+        finalists=finalists,
+        search_points=[changed(point, parameters=hidden) for point in summary.search_points],
+        budget=HOSTILE,
+        explained=(),
+    )
 
 
 @pytest.fixture
 def page(tmp_path):
     run = RunFolder(shutil.copytree(SAMPLE, tmp_path / "run", ignore=shutil.ignore_patterns("explanation")))
-    run.write("summary.json", hostile(whole_summary(run.read("summary.json"))))
+    run.write_summary(hostile(whole_summary(run.summary())))
     study, environment = run.read("study.json"), run.read("environment.json")
     study["data"]["path"] = HOSTILE
     run.write("study.json", study)
@@ -89,4 +96,4 @@ def test_damaged_arrays_are_named(tmp_path):
     for content in (b"", b"PK\x03\x04", b"no archive"):
         (tmp_path / "explanation" / "baseline.npz").write_bytes(content)
         with pytest.raises(DataError, match=r"baseline\.npz: no arrays"):
-            read_explanations(RunFolder(tmp_path))
+            read_explanations(RunFolder(tmp_path), ["baseline"])

@@ -1,35 +1,18 @@
 """Charts of importance show every hyperparameter, its interval, what could have been found, and each raw trial."""
 
 import pytest
-from summaries import dependence
+from summaries import changed, dependence, importance, judged, unvaried
 
 from cconv.report.importance_plots import importance_chart, partial_dependence_chart
 
 
-def judged(share, decided):
-    return {
-        "share": share, "low": share / 2, "high": share * 1.5, "p_value": 0.5, "decided": decided,
-        "f_anova": share / 3, "ped_anova": share / 4,
-    }  # fmt: skip
-
-
 def entry(updates, censored):
-    constant = judged(0.0, False) | dict.fromkeys(("share", "low", "high", "p_value"))
-    return {
-        "updates": updates,
-        "trials": 40,
-        "censored": censored,
-        "clipped": 0,
-        "why_none": "",
-        "detectable_share": 0.33,
-        "surrogate_r2": 0.5,
-        "best_share": 0.1,
-        "parameters": {"small": judged(0.02, False), "constant": constant, "large": judged(0.6, True)},
-    }
+    parameters = {"small": judged(0.02, decided=False), "constant": unvaried(), "large": judged(0.6, decided=True)}
+    return importance(updates, parameters, censored)
 
 
 def test_a_panel_a_rung_for_what_was_tested_and_what_was_estimated_with_the_largest_on_top():
-    unknown = entry(50, False) | {"why_none": "too few", "parameters": {}}
+    unknown = changed(entry(50, False), why_none="too few", parameters={})
     figure = importance_chart([unknown, entry(100, False), entry(300, True)])
     assert len(figure.axes) == 4
     first, last = figure.axes[0], figure.axes[2]
@@ -44,8 +27,8 @@ def test_a_panel_a_rung_for_what_was_tested_and_what_was_estimated_with_the_larg
 def test_only_tested_shares_have_intervals_and_the_line_is_the_detectable_share():
     tested, estimated = importance_chart([entry(100, False)]).axes
     segments = [segment[:, 0].tolist() for segment in tested.collections[0].get_segments()]
-    assert segments == [[0.3, pytest.approx(0.9)], [0.01, pytest.approx(0.03)]]
-    assert list(tested.lines[0].get_xdata()) == [0.33, 0.33]
+    assert segments == [pytest.approx([0.45, 0.75]), pytest.approx([0.0, 0.025])]
+    assert list(tested.lines[0].get_xdata()) == [0.62, 0.62]
     assert [list(line.get_xdata()) for line in estimated.lines] == [
         pytest.approx([0.2, 0.02 / 3, 0]),
         pytest.approx([0.15, 0.005, 0]),

@@ -24,14 +24,14 @@ def run(finished_run):
 
 @pytest.fixture
 def summary(run):
-    return run.read("summary.json")
+    return run.summary()
 
 
 def test_the_baseline_is_trained_to_the_full_budget_and_is_a_finalist(run, summary):
     space = SearchSpace.model_validate(run.read("space.json"))
     (baseline,) = run.trials_of("baseline")
     assert (baseline.outcome, baseline.parameters) == ("completed", fixed(space, "boundary").baseline)
-    assert summary["baseline"] in {entry["id"] for entry in summary["finalists"]}
+    assert summary.baseline in {entry.id for entry in summary.finalists}
 
 
 def test_a_serial_study_ran_where_ray_cannot_be_imported_and_says_that_it_trained_one_at_a_time(run):
@@ -45,7 +45,7 @@ def test_a_serial_study_ran_where_ray_cannot_be_imported_and_says_that_it_traine
 def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
     records = run.trials()
     assert all(record.outcome in ("completed", "stopped", "diverged") for record in records)
-    counts = {stage: sum(outcomes.values()) for stage, outcomes in summary["trials"].items()}
+    counts = {stage: sum(outcomes.values()) for stage, outcomes in summary.trials.items()}
     known = {"closed_form": 4, "initialization": 6, "baseline": 1, "random": 4, "adaptive": 3}
     assert {stage: counts[stage] for stage in known} == known
     assert sum(counts.values()) == len(records) + sum(len(each) for each in run.retrainings().values())
@@ -54,13 +54,13 @@ def test_every_trial_ended_with_an_outcome_and_is_counted(run, summary):
 def test_every_stage_left_what_it_found(run):
     study = run.read("study.json")
     assert [stage for stage in study["stages"] if not run.has_result(stage)] == []
-    assert run.result("select")["recommended"] == run.read("summary.json")["recommended"]["id"]
+    assert run.result("select").recommended == run.summary().recommended.id
 
 
 def test_the_adaptive_stage_searches_the_refined_space(run):
     refined = load_space(run.path / "stages" / "refine.toml")
     assert all(refined.holds(record.parameters) for record in run.trials_of("adaptive"))
-    reasons = run.read("summary.json")["refined"]
+    reasons = run.summary().refined
     assert set(reasons) >= set(refined.parameters)
 
 
@@ -77,12 +77,12 @@ def test_all_trials_share_data_seed_and_searched_ones_their_initial_weights(run)
 
 
 def test_the_reference_trains_what_the_search_stopped_with_what_the_search_spent(run, summary):
-    for name, strategy in summary["references"]["strategies"].items():
-        assert strategy["updates"] > 0, name
-    asha, little = (summary["references"]["strategies"][f"random, {name}"] for name in ("ASHA", "a little each"))
+    for name, strategy in summary.references.strategies.items():
+        assert strategy.updates > 0, name
+    asha, little = (summary.references.strategies[f"random, {name}"] for name in ("ASHA", "a little each"))
     full = run.read("study.json")["training"]["updates"]
-    assert abs(little["updates"] - asha["updates"]) <= full
-    assert asha["best_valid"] == min(record.best for record in run.trials_of("random") if record.outcome == "completed")
+    assert abs(little.updates - asha.updates) <= full
+    assert asha.best_valid == min(record.best for record in run.trials_of("random") if record.outcome == "completed")
 
 
 def test_rungs_hold_the_errors_of_the_logs(run):
@@ -105,37 +105,34 @@ def test_finalists_were_retrained_with_seeds_that_the_search_did_not_use(run):
 @pytest.mark.parametrize("split", ["valid", "test"])
 def test_the_checkpoint_gives_the_reported_errors_again(run, summary, flow_folder, split):
     dataset = open_dataset(flow_folder)
-    for entry in summary["finalists"]:
-        model = load_model(run.path / entry["checkpoint"], task=summary["task"])
+    for entry in summary.finalists:
+        model = load_model(run.path / entry.checkpoint, task=summary.task.name)
         errors = frame_errors(model, iterate_samples(dataset, split, model.task))
-        seed = (run.path / entry["checkpoint"]).parent.name
-        assert normalized_mse(errors) == pytest.approx(entry[split]["by_seed"][seed], rel=1e-6)
-        assert model.num_parameters == entry["num_parameters"]
+        seed = (run.path / entry.checkpoint).parent.name
+        assert normalized_mse(errors) == pytest.approx(getattr(entry, split).by_seed[seed], rel=1e-6)
+        assert model.num_parameters == entry.num_parameters
 
 
-def test_summary_has_the_agreed_keys_and_consistent_figures(summary):
-    assert {"study", "task", "dataset", "baseline", "finalists", "pareto_front", "recommended", "trials"} <= set(
-        summary
-    )
-    names = {entry["id"] for entry in summary["finalists"]}
-    assert summary["baseline"] in names
-    assert summary["recommended"]["id"] in names
-    assert set(summary["pareto_front"]) <= names
-    for entry in summary["finalists"]:
-        assert entry["test"]["ci95"] is None  # of a single test trajectory
-        assert entry["test"]["units"]["count"] == 1
-        assert entry["test"]["relative_rmse"] ** 2 == pytest.approx(entry["test"]["normalized_mse"])
-        assert {"ms_per_frame", "us_per_particle", "peak_mb", "flops_per_particle"} <= set(entry["cost"])
+def test_the_summary_holds_what_every_stage_found_and_consistent_figures(summary):
+    assert {"ablation", "importance", "initialization", "references", "refined"} <= set(summary.found())
+    names = {entry.id for entry in summary.finalists}
+    assert summary.baseline in names
+    assert summary.recommended.id in names
+    assert set(summary.pareto_front) <= names
+    for entry in summary.finalists:
+        assert entry.test.ci95 is None  # of a single test trajectory
+        assert entry.test.units.count == 1
+        assert entry.test.relative_rmse**2 == pytest.approx(entry.test.normalized_mse)
 
 
 def test_what_was_chosen_was_chosen_by_validation_errors_and_each_split_has_its_mean_predictor(
     run, summary, flow_folder
 ):
-    dataset, comparisons = open_dataset(flow_folder), summary["selection"]["comparisons"]
-    errors = {entry["id"]: entry["valid"]["normalized_mse"] for entry in summary["finalists"]}
-    assert {each["id"]: each["error"] for each in comparisons} == pytest.approx(errors)
-    assert summary["recommended"]["id"] in {each["id"] for each in comparisons if each["eligible"]}
-    task = load_model(run.path / summary["finalists"][0]["checkpoint"]).task
+    dataset, comparisons = open_dataset(flow_folder), summary.selection.comparisons
+    errors = {entry.id: entry.valid.normalized_mse for entry in summary.finalists}
+    assert {each.id: each.error for each in comparisons} == pytest.approx(errors)
+    assert summary.recommended.id in {each.id for each in comparisons if each.eligible}
+    task = load_model(run.path / summary.finalists[0].checkpoint).task
     train, valid, test = (
         torch.cat([sample.target for sample in iterate_samples(dataset, split, task)]).double()
         for split in ("train", "valid", "test")
@@ -143,7 +140,7 @@ def test_what_was_chosen_was_chosen_by_validation_errors_and_each_split_has_its_
     variance = train.var(dim=0, correction=0).mean()
     for split, targets in (("valid", valid), ("test", test)):
         expected = (targets - train.mean(dim=0)).square().mean() / variance
-        assert summary["mean_predictor"][split] == pytest.approx(expected.item(), rel=1e-4)
+        assert getattr(summary.mean_predictor, split) == pytest.approx(expected.item(), rel=1e-4)
 
 
 def test_provenance_is_recorded(run, flow_folder):
@@ -166,18 +163,18 @@ def test_nothing_half_written_remains(run):
 
 
 def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, summary):
-    path = summary["ablation"]["path"]
+    path = summary.ablation.path
     space = fixed(SearchSpace.model_validate(run.read("space.json")), "boundary")
-    assert path[0]["parameters"] == space.baseline
+    assert path[0].parameters == space.baseline
     assert len(path) > 1
-    assert all(step["valid_error"] > 0 for step in path)
-    (density,) = [entry for entry in summary["ablation"]["branches"] if entry["left_out"] == "density"]
-    assert density["valid_error"] > 0
+    assert all(step.valid_error > 0 for step in path)
+    (density,) = [entry for entry in summary.ablation.branches if entry.change == "density"]
+    assert density.valid_error > 0
 
 
 def test_the_explanation_of_the_recommended_model_and_the_baseline_is_kept(run, summary):
     kept = {path.stem for path in (run.path / "explanation").glob("*.npz")}
-    assert kept == {"baseline", summary["recommended"]["id"]}
+    assert kept == {"baseline", summary.recommended.id}
 
 
 SPACE_WITH_FAILURES = """
@@ -236,9 +233,9 @@ def test_a_trial_that_fails_is_an_outcome_and_the_study_goes_on(cconv, flow_fold
     failed = [record for record in run.trials() if record.outcome == "failed"]
     assert {record.parameters["network.relative_cutoff"] for record in failed} == {6.0}
     assert all("half of every periodic axis" in record.reason for record in failed)
-    counts = run.read("summary.json")["trials"]
+    counts = run.summary().trials
     assert counts["random"]["failed"] + counts["adaptive"]["failed"] == len(failed) >= 1
-    assert [entry["id"] for entry in run.read("summary.json")["finalists"]] == ["baseline"]
+    assert [entry.id for entry in run.summary().finalists] == ["baseline"]
     before = {record.id: record.log for record in run.trials()}
     status, _, error = cconv("study", "extend", folder, "--serial", "--stage", "random", "--trials", "3")
     assert status == 0, error

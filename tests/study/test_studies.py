@@ -13,6 +13,7 @@ from cconv.study import studies
 from cconv.study.declared.search_space import load_space
 from cconv.study.declared.stage import Stage, kind_of
 from cconv.study.pipeline import begin_study, run_study
+from cconv.study.records.found import Found
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.running.observer import Observer
 from cconv.study.running.problem import with_data_path
@@ -30,7 +31,7 @@ class ToyStage(Stage):
 
     def run(self, session, name):
         """Return the weighted count."""
-        return {"toy": self.weight * len(session.read(name))}
+        return Found(refined={"toy": f"{self.weight * len(session.read(name))}"})
 
 
 class Unwatched(Observer):
@@ -90,8 +91,8 @@ def test_a_class_in_the_list_is_all_that_a_run_needs(with_toy, flow_folder, tmp_
     begin_study(config, load_space(SMOKE.parent / config.search.space, config), run)
     assert run_study(run, Unwatched()) is None
     assert recorded_study(run) == config
-    assert run.result("toy")["kind"] == "toy"
-    assert run.result("toy")["toy"] == 5 * 2
+    assert run.result("toy").kind == "toy"
+    assert run.result("toy").refined == {"toy": f"{5 * 2}"}
 
 
 def test_a_study_travels_to_other_processes():

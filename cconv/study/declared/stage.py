@@ -56,8 +56,8 @@ class Stage(StrictModel, ABC):
         return ()
 
     @abstractmethod
-    def run(self, session: Any, name: str) -> dict:
-        """Do the work of the stage and return what it found, as it stands in ``stages/<name>.json``.
+    def run(self, session: Any, name: str) -> StrictModel:
+        """Do the work of the stage and return what it found, a `Found` of the package `records`.
 
         A run that was interrupted calls it again: what is recorded already must not be computed twice.
 

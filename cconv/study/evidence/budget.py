@@ -4,21 +4,23 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from cconv.study.records.found import BudgetPoint, Convergence
+from cconv.study.records.summary import FinalistEntry
 from cconv.study.records.trials import TrialRecord
 
 LAST_PART = 0.25  # of the updates of a training
 
 
-def still_falling(points: Sequence[Mapping], margin: float) -> bool:
+def still_falling(points: Sequence[BudgetPoint], margin: float) -> bool:
     """Whether the last budget lowered the validation error of the one before it by more than `margin`, a share.
 
     Args:
-        points: Entries of ascending budgets with their "valid_error"; a single one says nothing, so True.
+        points: Trainings with ascending budgets; a single one says nothing, so True.
         margin: Share of the error.
     """
     if len(points) < 2:
         return True
-    before, last = (point["valid_error"] for point in points[-2:])
+    before, last = (point.valid_error for point in points[-2:])
     return last < (1 - margin) * before
 
 
@@ -37,20 +39,20 @@ def fall_at_the_end(records: Sequence[TrialRecord]) -> float | None:
     return float(np.mean(falls)) if falls else None
 
 
-def budget_words(entries: Sequence[Mapping], convergence: Mapping[str, Mapping], margin: float) -> str:
+def budget_words(finalists: Sequence[FinalistEntry], convergence: Mapping[str, Convergence], margin: float) -> str:
     """What a budget decided, in sentences; "" where no model gained from a larger one or was still improving.
 
     Args:
-        entries: Finalists as they stand in summary.json, with "updates" and "fall_at_the_end".
+        finalists: The finalists.
         convergence: What the converge stages found, by model.
         margin: Share of the error below which a gain counts as none.
     """
-    sentences = [_gain(name, found) for name, found in convergence.items() if len(found["points"]) > 1]
-    longer = {point["id"] for found in convergence.values() for point in found["points"]}
+    sentences = [_gain(name, found) for name, found in convergence.items() if len(found.points) > 1]
+    longer = {point.id for found in convergence.values() for point in found.points}
     falling = [
-        f"{entry['id']} (by {entry['fall_at_the_end']:.0%} in the last quarter of its {entry['updates']:,} updates)"
-        for entry in entries
-        if entry["id"] not in longer and (entry["fall_at_the_end"] or 0) > margin
+        f"{entry.id} (by {entry.fall_at_the_end:.0%} in the last quarter of its {entry.updates:,} updates)"
+        for entry in finalists
+        if entry.id not in longer and (entry.fall_at_the_end or 0) > margin
     ]
     if falling:
         sentences.append(
@@ -59,10 +61,10 @@ def budget_words(entries: Sequence[Mapping], convergence: Mapping[str, Mapping],
     return " ".join(sentences)
 
 
-def _gain(name: str, found: Mapping) -> str:
-    first, last = found["points"][0], found["points"][-1]
-    end = "and it was still falling" if found["still_falling"] else "and more updates bring nothing"
+def _gain(name: str, found: Convergence) -> str:
+    first, last = found.points[0], found.points[-1]
+    end = "and it was still falling" if found.still_falling else "and more updates bring nothing"
     return (
-        f"The budget of {first['updates']:,} updates decided the error of {name}, {first['valid_error']:.3g}: "
-        f"after {last['updates']:,} updates it is {last['valid_error']:.3g} (validation), {end}."
+        f"The budget of {first.updates:,} updates decided the error of {name}, {first.valid_error:.3g}: "
+        f"after {last.updates:,} updates it is {last.valid_error:.3g} (validation), {end}."
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from cconv.errors import DataError, ShapeError
 from cconv.evaluation.statistics import mean_interval, paired_logarithms, times_tie, why_no_interval
+from cconv.study.records.summary import AttainmentStep, Hypervolume
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def hypervolume(points: Iterable[tuple[float, float]], reference: tuple[float, f
 
 def hypervolume_interval(
     errors: Mapping[str, np.ndarray], cost: Mapping[str, float], reference: tuple[float, float]
-) -> dict:
+) -> Hypervolume:
     """Hypervolume of the typical errors of all models, with its 95 % interval over other seeds and units.
 
     A typical error is the geometric mean over seeds and units. On logarithmic axes the area is a sum of the logarithms
@@ -102,7 +103,7 @@ def hypervolume_interval(
         reference: (error, cost) of the corner.
 
     Returns:
-        "value", "ci95" (None where "why_no_interval" has a reason) and "reference".
+        The hypervolume; its reference is (cost, error), in the order of the axes of a chart.
 
     Raises:
         ShapeError: If the models differ in their units.
@@ -124,12 +125,12 @@ def hypervolume_interval(
         np.zeros(shape),
     )
     interval = mean_interval(area + deviations)
-    return {
-        "value": area,
-        "ci95": None if interval is None else [max(interval[0], 0.0), interval[1]],
-        "why_no_interval": why_no_interval(*shape),
-        "reference": [float(value) for value in reference],
-    }
+    return Hypervolume(
+        value=area,
+        ci95=None if interval is None else (max(interval[0], 0.0), interval[1]),
+        why_no_interval=why_no_interval(*shape),
+        reference=(float(corner_cost), float(corner_error)),
+    )
 
 
 def attainment(
@@ -139,7 +140,7 @@ def attainment(
     levels: tuple[float, float] = (0.1, 0.9),
     draws: int = 1000,
     seed: int = 0,
-) -> dict[str, list[float]]:
+) -> list[AttainmentStep]:
     """Error that one training of each model attains at a cost: a band of step functions.
 
     A draw takes one seed of each model, and its mean error over the units; the smallest error among the models of at
@@ -155,7 +156,7 @@ def attainment(
         seed: Seed of the draws.
 
     Returns:
-        "cost", the models' costs in ascending order, where the steps are; "low", "median" and "high", errors there.
+        A step at each model's cost, in ascending order.
 
     Raises:
         ShapeError: If the models differ in their units.
@@ -166,7 +167,11 @@ def attainment(
     drawn = np.stack([rng.choice(errors[name].mean(axis=1), draws) for name in names], axis=1)
     attained = np.minimum.accumulate(drawn, axis=1)
     low, median, high = np.quantile(attained, (levels[0], 0.5, levels[1]), axis=0).tolist()
-    return {"cost": [float(cost[name]) for name in names], "low": low, "median": median, "high": high}
+    steps = zip(names, median, low, high, strict=True)
+    return [
+        AttainmentStep(ms_per_frame=cost[name], median=middle, low=lowest, high=highest)
+        for name, middle, lowest, highest in steps
+    ]
 
 
 def _check(errors: Mapping[str, np.ndarray], cost: Mapping[str, float]) -> None:

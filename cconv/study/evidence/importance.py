@@ -21,6 +21,7 @@ from optuna.trial import create_trial
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.evidence.effects import FAMILY_LEVEL, adjusted_p_values, detectable_share, effects
 from cconv.study.evidence.surrogate import FEWEST_TRIALS, Axis, axes_of, coordinates, cross_validated_r2, trials_at
+from cconv.study.records.found import ParameterImportance, RungImportance
 from cconv.study.records.trials import TrialRecord
 
 _TREES = 12
@@ -35,7 +36,7 @@ def importance_by_rung(
     *,
     useless_error: float,
     seed: int = 0,
-) -> list[dict]:
+) -> list[RungImportance]:
     """Importance of every hyperparameter at each rung, from the trials that have an error at exactly that rung.
 
     Args:
@@ -47,14 +48,8 @@ def importance_by_rung(
         seed: Of permutations and forests.
 
     Returns:
-        One entry a rung: "updates", "trials"; "clipped", how many count with the useless error; "censored", whether
-        trials were stopped before that do not count, so that what is left is a selection; "why_none", the reason why
-        no importance is given, or "". Then "parameters" is empty, else it gives for each hyperparameter "share" of the
-        variance with its 95 % interval from "low" to "high" (None if the trials do not vary it); "p_value", adjusted
-        for the number of hyperparameters, and "decided", whether it is below 5 %; "f_anova", a share of the variance;
-        "ped_anova", a share of the sum over all. "detectable_share" is the smallest share that is found four times in
-        five whichever hyperparameter has it, "surrogate_r2" is that of f-ANOVA's kind of forest on unseen trials,
-        "best_share" says which trials are PED-ANOVA's best; all None without importances.
+        One entry a rung. Where trials that were stopped before are missing, what is left is a selection. The
+        detectable share is found whichever hyperparameter has it; the surrogate is f-ANOVA's kind of forest.
     """
     axes = axes_of(space)
     entries = []
@@ -70,9 +65,8 @@ def importance_by_rung(
             "why_none": _why_none(axes, points, targets, clipped),
         }
         rng = np.random.default_rng([seed, updates])
-        entries.append(
-            facts | (_NONE if facts["why_none"] else _measure(axes, points, targets, int(rng.integers(2**31))))
-        )
+        measured = _NONE if facts["why_none"] else _measure(axes, points, targets, int(rng.integers(2**31)))
+        entries.append(RungImportance(**facts, **measured))
     return entries
 
 
@@ -109,7 +103,9 @@ def _measure(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray
         "surrogate_r2": cross_validated_r2(axes, points, targets, seed=seed),
         "best_share": best,
         "parameters": {
-            axis.name: tested[axis.name] | {"f_anova": float(f_anova[k]), "ped_anova": float(ped_anova[k])}
+            axis.name: ParameterImportance(
+                **tested[axis.name], f_anova=float(f_anova[k]), ped_anova=float(ped_anova[k])
+            )
             for k, axis in enumerate(axes)
         },
     }

@@ -16,6 +16,7 @@ from cconv.study.evidence.surrogate import (
     cross_validated_r2,
     trials_at,
 )
+from cconv.study.records.found import PartialDependence, TrialPoint
 from cconv.study.records.trials import TrialRecord
 
 
@@ -27,7 +28,7 @@ def partial_dependence(
     *,
     useless_error: float,
     seed: int = 0,
-) -> dict:
+) -> PartialDependence:
     """How the error depends on one hyperparameter when the others are as in the trials, by a random forest.
 
     Source: Friedman, "Greedy Function Approximation", Ann. Statist. 29 (2001), section 8.2, on log10 error.
@@ -41,9 +42,8 @@ def partial_dependence(
         seed: Of the forest.
 
     Returns:
-        "parameter", "scale" ("linear", "log" or "choice"), "updates", "trials", "surrogate_r2"; "values", and at each
-        of them "error" with "low" and "high", the middle 80 % of the forest's trees, which is no confidence interval;
-        "points", the raw trials: "value", "error".
+        The mean error at values of the hyperparameter, with the middle 80 % of the forest's trees, which is no
+        confidence interval, and the raw trials.
 
     Raises:
         ConfigError: If the space does not vary the hyperparameter, or fewer than ten trials have these updates.
@@ -60,22 +60,22 @@ def partial_dependence(
     grid = _grid(axis)
     means = _means_by_tree(Surrogate(axes, seed=seed).fit(points, targets), points, number, grid)
     low, high = np.percentile(means, (10, 90), axis=0)
-    return {
-        "parameter": parameter,
-        "scale": _scale(axis),
-        "updates": updates,
-        "trials": len(trials),
-        "surrogate_r2": cross_validated_r2(axes, points, targets, seed=seed),
-        "values": [axis.decode(coordinate) for coordinate in grid],
-        "error": (10 ** means.mean(axis=0)).tolist(),
-        "low": (10**low).tolist(),
-        "high": (10**high).tolist(),
-        "points": [
-            {"value": axis.decode(point), "error": float(10**target)}
+    return PartialDependence(
+        parameter=parameter,
+        scale=_scale(axis),
+        updates=updates,
+        trials=len(trials),
+        surrogate_r2=cross_validated_r2(axes, points, targets, seed=seed),
+        values=[axis.decode(coordinate) for coordinate in grid],
+        error=(10 ** means.mean(axis=0)).tolist(),
+        low=(10**low).tolist(),
+        high=(10**high).tolist(),
+        points=[
+            TrialPoint(value=axis.decode(point), error=float(10**target))
             for point, target, trial in zip(points[:, number], targets, trials, strict=True)
             if parameter in trial.parameters
         ],
-    }
+    )
 
 
 def _scale(axis: Axis) -> str:

@@ -15,6 +15,7 @@ from cconv.evaluation.statistics import (
     why_no_interval,
 )
 from cconv.study.evidence.front import Timing, pareto_front
+from cconv.study.records.summary import ExpectedError
 from cconv.study.records.trials import TrialRecord, identity
 
 SHOWN_FAILURES = 2  # of a model, in words
@@ -169,7 +170,7 @@ def recommend(
 
 def retrained_error(
     valid: Mapping[str, np.ndarray], test: Mapping[str, np.ndarray], choose: Callable[[Mapping], str]
-) -> dict | None:
+) -> ExpectedError | None:
     """Error to expect of the chosen model if it is trained again, free of the luck of the seeds that it was chosen by.
 
     Validation and test errors of a model share its trained networks: their mean test error is fair to these networks,
@@ -182,7 +183,7 @@ def retrained_error(
         choose: Validation errors to the name of the chosen model.
 
     Returns:
-        "normalized_mse", mean over the seeds; "choices", how often each model was chosen. None without several seeds.
+        The mean error over the seeds, and how often each model was chosen; None without several seeds.
     """
     seeds = max(len(table) for table in valid.values())
     if seeds < 2:
@@ -193,10 +194,10 @@ def retrained_error(
         name = choose(kept)
         found.append((name, float(test[name][seed % len(test[name])].mean())))
     names = [name for name, _ in found]
-    return {
-        "normalized_mse": float(np.mean([error for _, error in found])),
-        "choices": {name: names.count(name) for name in dict.fromkeys(names)},
-    }
+    return ExpectedError(
+        normalized_mse=float(np.mean([error for _, error in found])),
+        choices={name: names.count(name) for name in dict.fromkeys(names)},
+    )
 
 
 def _best(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], failures: Mapping) -> str:

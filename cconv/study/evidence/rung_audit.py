@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
+from cconv.study.records.found import RungAudit
 from cconv.study.records.trials import TrialRecord
 
 RELIABLE_CORRELATION = 0.6
@@ -18,7 +19,7 @@ MEASURES = ("spearman", "kendall", "crossing_rate", "recall", "survival", "regre
 
 def audit_rungs(
     records: Sequence[TrialRecord], rungs: Sequence[int], *, top: float = 0.1, kept: float = 1 / 3
-) -> list[dict]:
+) -> list[RungAudit]:
     """How well the order of trials at a rung foretells their order at the full budget.
 
     A trial that diverged has no error at the full budget and takes no part.
@@ -30,9 +31,8 @@ def audit_rungs(
         kept: Share of the trials that goes on from a rung: ASHA's 1 / reduction factor.
 
     Returns:
-        One entry a rung: "updates", "trials", "top" (how many count as best), the measures of `rung_measures`, None
-        below four trials; "spearman_ci95", the 95 % interval of Spearman's correlation, or None where
-        "why_no_interval" has a reason; "verdict". The verdict is "undecided" without an interval; "unreliable" if the
+        One entry a rung, with the measures of `rung_measures`, None below four trials, and the 95 % interval of
+        Spearman's correlation. The verdict is "undecided" without an interval; "unreliable" if the
         correlation falls short of 0.6 or the survival of two thirds; "reliable" if the survival does not and the whole
         interval lies above 0.6; else "undecided". The other measures have no interval: of those that were tried none
         holds the true value often enough.
@@ -40,7 +40,7 @@ def audit_rungs(
     return [_audit(records, updates, top=top, kept=kept) for updates in rungs]
 
 
-def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: float) -> dict:
+def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: float) -> RungAudit:
     at_rung, at_full = _errors_at_both(records, updates)
     trials = len(at_rung)
     counts = {"top": min(trials, max(3, math.ceil(top * trials))), "kept": max(1, math.ceil(kept * trials))}
@@ -48,15 +48,15 @@ def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: fl
     if trials >= FEWEST_TRIALS:
         measures = rung_measures(at_rung, at_full, **counts)
     interval = None if measures["spearman"] is None else spearman_interval(measures["spearman"], trials)
-    return {
-        "updates": updates,
-        "trials": trials,
-        "top": counts["top"],
+    return RungAudit(
+        updates=updates,
+        trials=trials,
+        top=counts["top"],
         **measures,
-        "spearman_ci95": interval,
-        "why_no_interval": "" if interval else _why_no_interval(trials),
-        "verdict": "undecided" if interval is None else _verdict(measures, interval),
-    }
+        spearman_ci95=interval,
+        why_no_interval="" if interval else _why_no_interval(trials),
+        verdict="undecided" if interval is None else _verdict(measures, interval),
+    )
 
 
 def _why_no_interval(trials: int) -> str:

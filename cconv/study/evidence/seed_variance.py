@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
+from cconv.study.records.found import SeedVariance
 from cconv.study.records.trials import TrialRecord
 
 FEWEST_VALUES = 8  # below, intervals of a share of variances cover 98 % and more, or far less if values are skewed
@@ -18,7 +19,7 @@ def variance_decomposition(
     *,
     resamples: int = 4999,
     seed: int = 0,
-) -> list[dict]:
+) -> list[SeedVariance]:
     """Spread over seeds of one configuration beside the spread over configurations with one seed, at each rung.
 
     Args:
@@ -30,18 +31,17 @@ def variance_decomposition(
         seed: Seed of the resampling.
 
     Returns:
-        Entries of "updates"; "seeds" and "configurations", how many of each reached the rung; "seed_spread" and
-        "configuration_spread", standard deviations of the decimal logarithm of the error; "seed_share", the variance
-        over seeds by that over configurations, which holds both; "seed_share_ci95", its 95 % interval, None below
-        `FEWEST_VALUES` of either. A rung that fewer than two of either reached has no entry.
+        One entry a rung; the variance over configurations holds that over seeds. The interval of their ratio is None
+        below `FEWEST_VALUES` of either. A rung that fewer than two of either reached has no entry.
     """
     entries = []
     for updates in rungs:
         over_seeds = _logarithms(seed_records, updates)
         over_configurations = _logarithms(configuration_records, updates)
         if min(len(over_seeds), len(over_configurations)) > 1:
-            entry = {"updates": updates, "seeds": len(over_seeds), "configurations": len(over_configurations)}
-            entries.append(entry | compare_variances(over_seeds, over_configurations, resamples=resamples, seed=seed))
+            compared = compare_variances(over_seeds, over_configurations, resamples=resamples, seed=seed)
+            counts = {"seeds": len(over_seeds), "configurations": len(over_configurations)}
+            entries.append(SeedVariance(updates=updates, **counts, **compared))
     return entries
 
 

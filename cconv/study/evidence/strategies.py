@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cconv.study.records.found import ReplayedStrategy, SpentUpdates
 from cconv.study.records.rungs import RungTable
 from cconv.study.records.trials import TrialRecord
 
@@ -24,11 +25,11 @@ class Replay:
     best_error: float
 
 
-def spent_updates(records: Sequence[TrialRecord], full_updates: int) -> dict:
-    """Updates that trials of any outcome spent: "updates", "full_updates" had none been stopped, and their "share"."""
+def spent_updates(records: Sequence[TrialRecord], full_updates: int) -> SpentUpdates:
+    """Updates that one or more trials of any outcome spent, and what they would have spent had none been stopped."""
     spent = sum(record.log[-1]["updates"] for record in records if record.log)
     full = len(records) * full_updates
-    return {"updates": spent, "full_updates": full, "share": spent / full if full else None}
+    return SpentUpdates(updates=spent, full_updates=full, share=spent / full)
 
 
 def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
@@ -100,7 +101,7 @@ def replay_little_each(curves: Mapping[str, Curve], updates_each: int, keep: int
 
 def compare_strategies(
     curves: Mapping[str, Curve], rungs: Sequence[int], reduction_factor: int, *, draws: int = 200, seed: int = 0
-) -> list[dict]:
+) -> list[ReplayedStrategy]:
     """ASHA, a little of each at every rung for the same updates, and no stopping, on redrawn trials in random order.
 
     Each draw takes as many trials as there are, with replacement, so that the spread holds both the luck of the order
@@ -114,10 +115,8 @@ def compare_strategies(
         seed: Seed of the draws.
 
     Returns:
-        One entry a strategy: "strategy" ("asha", "little_each" or "no_stopping"); "updates_each" and "keep", None but
-        for the second; "share", mean updates by those of no stopping; "regret", the geometric mean over draws of its
-        best error divided by the best of the draw, and "regret_range95", 2.5 and 97.5 percentiles of that ratio. Empty
-        if no curve was measured at every rung; others do not count.
+        One entry a strategy; the share is that of the mean updates, and the range holds the 2.5 and 97.5 percentiles.
+        Empty if no curve was measured at every rung; others do not count.
     """
     curves = {trial: curve for trial, curve in curves.items() if set(rungs) <= set(dict(curve))}
     if not curves:
@@ -145,17 +144,17 @@ def _strategy(
     replays: Sequence[Replay],
     updates_each: int | None = None,
     keep: int | None = None,
-) -> dict:
+) -> ReplayedStrategy:
     shares, regrets = [], []
     for sample, replay in zip(samples, replays, strict=True):
         chosen = [curves[trial] for trial in sample]
         shares.append(replay.updates / sum(curve[-1][0] for curve in chosen))
         regrets.append(replay.best_error / min(curve[-1][1] for curve in chosen))
-    return {
-        "strategy": name,
-        "updates_each": updates_each,
-        "keep": keep,
-        "share": float(np.mean(shares)),
-        "regret": float(np.exp(np.mean(np.log(regrets)))),
-        "regret_range95": [float(end) for end in np.percentile(regrets, (2.5, 97.5))],
-    }
+    return ReplayedStrategy(
+        strategy=name,
+        updates_each=updates_each,
+        keep=keep,
+        share=float(np.mean(shares)),
+        regret=float(np.exp(np.mean(np.log(regrets)))),
+        regret_range95=np.percentile(regrets, (2.5, 97.5)).tolist(),
+    )

@@ -7,24 +7,22 @@ from pydantic import BaseModel, Field, RootModel
 
 from cconv.errors import DataError
 from cconv.files import read_json
-from cconv.validation import Flag, Id, Name, OpenModel, Real, Value, Whole, validated
+from cconv.validation import Flag, Model, Name, OpenModel, Real, Value, Whole, validated
 
 OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
 
 
-_Count = Annotated[Whole, Field(ge=0, lt=2**63)]
-
-
-_Error = Annotated[Real, Field(ge=0)]
+Count = Annotated[Whole, Field(ge=0, lt=2**63)]
+NonNegative = Annotated[Real, Field(ge=0)]
 
 
 class Entry(OpenModel):
     """A line of log.jsonl."""
 
-    updates: _Count
-    valid_error: _Error | None
-    seconds: _Error
-    train_loss: _Error | None = None
+    updates: Count
+    valid_error: NonNegative | None
+    seconds: NonNegative
+    train_loss: NonNegative | None = None
     learning_rate: Real | None = None
     diverged: Flag = False
 
@@ -35,8 +33,8 @@ class TrainingDescription(OpenModel):
     stage: Name
     parameters: dict[str, Value]
     init_seed: Annotated[Whole, Field(ge=0, lt=2**32)] | None = None
-    num_parameters: _Count | None = None
-    flops_per_particle: _Error | None = None
+    num_parameters: Count | None = None
+    flops_per_particle: NonNegative | None = None
     closed_form: Flag = False
 
 
@@ -56,7 +54,7 @@ class _StageSettings(OpenModel):
 class _Study(OpenModel):
     """study.json, as far as a reader of records needs it."""
 
-    format: _Count = 1
+    format: Count = 1
     id: Annotated[str, Field(pattern=r"^[0-9a-f]{1,64}$")] = "0"
     name: Name = "study"
     stages: Annotated[dict[Name, _StageSettings], Field(min_length=1, max_length=100)]
@@ -72,8 +70,8 @@ class _State(OpenModel):
 class _Rung(OpenModel):
     """A rung of a stage in rungs.json."""
 
-    updates: _Count
-    recorded: dict[str, _Error]
+    updates: Count
+    recorded: dict[str, NonNegative]
 
 
 class Rungs(RootModel):
@@ -109,7 +107,7 @@ class _Environment(OpenModel):
     packages: dict[str, str | None]
     seeds: _Seeds
     data: _DataFolder
-    data_findings: list[_Line] = []
+    data_findings: list[_Line]
 
 
 class Table(RootModel):
@@ -118,84 +116,25 @@ class Table(RootModel):
     root: dict
 
 
-class Result(OpenModel):
-    """What a stage has found, in stages/."""
-
-    kind: str
-    seconds: _Error
-    finalists: dict[Id, dict[str, Value]] = {}
-
-
-class _Model(OpenModel):
-    """The recommended model in summary.json."""
-
-    id: Id
-    reason: str
-
-
-class _Finding(OpenModel):
-    """What a check of stability found in a finalist in summary.json."""
-
-    check: Name
-    label: str
-    value: Real
-    limit: Real
-    detail: str
-
-
-class _Stability(OpenModel):
-    """Stability of a finalist in summary.json."""
-
-    stable: Flag
-    findings: list[_Finding]
-    failures: list[str]
-    counts: dict[str, _Count]
-
-
-class _Finalist(OpenModel):
-    """A finalist in summary.json."""
-
-    id: Id
-    num_parameters: _Count
-    config: dict
-    test: dict
-    cost: dict
-    stability: _Stability | None
-
-
-class _Importance(OpenModel):
-    """Importance at a rung in summary.json."""
-
-    updates: _Count
-    trials: _Count
-    why_none: str
-    parameters: dict[str, dict]
-
-
-class _Summary(OpenModel):
-    """summary.json, as far as every reader needs it."""
-
-    study: Name
-    baseline: Name
-    checks: dict[Name, str]
-    recommended: _Model
-    finalists: Annotated[list[_Finalist], Field(min_length=1)]
-    pareto_front: list[Id]
-    wall_seconds: _Error
-    importance: list[_Importance] = []
-
-
 FORMS = {
     "study.json": _Study,
     "environment.json": _Environment,
     "state.json": _State,
     "rungs.json": Rungs,
-    "summary.json": _Summary,
 }
 
 
+def read_typed(path: Path, form: type[Model]) -> Model:
+    """Content of a JSON file as an instance of its form.
+
+    Raises:
+        DataError: If the file is missing or damaged, or a key or value does not fit.
+    """
+    return validated(form, read_json(path), path, DataError)
+
+
 def read_record(path: Path, form: type[BaseModel] = Table):
-    """Content of a JSON file that fits a form.
+    """Content of a JSON file that fits a form, as it stands there.
 
     Raises:
         DataError: If the file is missing or damaged, or a key or value does not fit.

@@ -10,7 +10,9 @@ from filelock import Timeout
 
 from cconv.errors import ConfigError, DataError, shown
 from cconv.files import held, write_json
-from cconv.study.records.forms import FORMS, Result, Table, read_record
+from cconv.study.records.forms import FORMS, Table, read_record, read_typed
+from cconv.study.records.found import Found, StageResult
+from cconv.study.records.summary import Summary
 from cconv.study.records.trials import KNOWN_BEFORE, TrialFolder, TrialRecord
 from cconv.validation import Id, check_setting
 
@@ -137,15 +139,48 @@ class RunFolder:
 
     def has_result(self, stage: str) -> bool:
         """Whether a stage has come to its end."""
-        return (self.path / "stages" / f"{stage}.json").is_file()
+        return self._result(stage).is_file()
 
-    def result(self, stage: str) -> dict:
-        """What a stage that ended has found."""
-        return self.read(f"stages/{stage}.json")
+    def result(self, stage: str) -> StageResult:
+        """What a stage that ended has found.
+
+        Raises:
+            DataError: If its file is missing or damaged, or a key or value does not fit.
+        """
+        return read_typed(self._result(stage), StageResult)
+
+    def write_result(self, stage: str, kind: str, seconds: float, found: Found) -> None:
+        """Record what a stage has found, by which a reader knows that it has ended."""
+        result = {"kind": kind, "seconds": seconds} | found.model_dump(mode="json", exclude_unset=True)
+        write_json(self._result(stage), result)
 
     def forget_result(self, stage: str) -> None:
         """Make a stage one that has not come to its end; its trials stay."""
-        (self.path / "stages" / f"{stage}.json").unlink(missing_ok=True)
+        self._result(stage).unlink(missing_ok=True)
+
+    def _result(self, stage: str) -> Path:
+        return self.path / "stages" / f"{stage}.json"
+
+    @property
+    def has_summary(self) -> bool:
+        """Whether the study has recommended a model."""
+        return self._summary.is_file()
+
+    def summary(self) -> Summary:
+        """What a study that recommended a model has found.
+
+        Raises:
+            DataError: If its file is missing or damaged, or a key or value does not fit.
+        """
+        return read_typed(self._summary, Summary)
+
+    def write_summary(self, summary: Summary) -> None:
+        """Write ``summary.json``."""
+        write_json(self._summary, summary.model_dump(mode="json", exclude_unset=True))
+
+    @property
+    def _summary(self) -> Path:
+        return self.path / "summary.json"
 
     def retrainings(self) -> dict[str, list[TrialRecord]]:
         """Records of all retrainings, by finalist."""
@@ -170,7 +205,7 @@ class RunFolder:
         Raises:
             DataError: If it is missing or damaged, or a key or value does not fit.
         """
-        return read_record(self.path / name, Result if name.startswith("stages/") else FORMS.get(name, Table))
+        return read_record(self.path / name, FORMS.get(name, Table))
 
     def set_state(self, state: str, stage: str) -> None:
         """Record whether the run is "running", "finished", "interrupted" or "failed", and in which stage."""

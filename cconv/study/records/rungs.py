@@ -11,6 +11,7 @@ import numpy as np
 
 from cconv.files import write_json
 from cconv.study.records.forms import read_rungs
+from cconv.study.records.summary import PassedRung
 
 
 class RungTable:
@@ -42,18 +43,18 @@ class RungTable:
             return True
         return bool(error <= np.percentile(before, 100 * self._quantile))
 
-    def passed(self) -> list[dict]:
-        """How many went on from each rung but the last: "updates", "trials" and "passed".
+    def passed(self) -> list[PassedRung]:
+        """How many went on from each rung but the last that was reached.
 
         More than 1 / `reduction_factor` do: the first trial at a rung always goes on, and those soon after it are
         compared with few others.
         """
         return [
-            {
-                "updates": updates,
-                "trials": len(errors),
-                "passed": sum(self.record(trial, updates, error) for trial, error in errors.items()),
-            }
+            PassedRung(
+                updates=updates,
+                trials=len(errors),
+                passed=sum(self.record(trial, updates, error) for trial, error in errors.items()),
+            )
             for updates, errors in zip(self.rungs[:-1], self._recorded, strict=False)
             if errors
         ]

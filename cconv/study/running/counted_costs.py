@@ -9,6 +9,7 @@ from cconv.evaluation.time_model import check_cost_model
 from cconv.networks.counting import CountedCost, NeighborDensity
 from cconv.study.declared.configuration import configure
 from cconv.study.declared.study_file import StudyConfig
+from cconv.study.records.summary import CostModel, SearchPoint
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.problem import Problem
 from cconv.tasks.features import WALLS, kinds_of
@@ -48,7 +49,9 @@ class CostCounter:
         return neighbor_density(self._inputs, relative_cutoff)
 
 
-def points_of_search(count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]) -> dict:
+def points_of_search(
+    count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]
+) -> tuple[list[SearchPoint], CostModel | None]:
     """Error and time of every trial, the time by a cost model that is fitted to measured models and checked on them.
 
     Args:
@@ -57,31 +60,31 @@ def points_of_search(count: CostCounter, records: Sequence[TrialRecord], measure
         measured: Models that were timed in one run, by the id of the trial that found them.
 
     Returns:
-        "search_points", an entry a trial, and "cost_model", the check; empty with fewer than five measured models.
+        A point of each trial with an error, and the cost model; none with fewer than five measured models.
     """
     by_id = {record.id: record for record in records}
     known = {name: cost for name, cost in measured.items() if name in by_id}
     if len(known) < FEWEST_MEASURED:
-        return {}
+        return [], None
     check = check_cost_model(
         {name: count(by_id[name].parameters) for name in known},
         {name: cost.us_per_particle for name, cost in known.items()},
     )
     particles = next(iter(known.values())).num_particles
 
-    def point(record: TrialRecord) -> dict:
+    def point(record: TrialRecord) -> SearchPoint:
         measurement = known.get(record.id)
         predicted = 1e-3 * particles * check.time_model.predict(count(record.parameters))
-        return {
-            "id": record.id,
-            "stage": record.stage,
-            "valid_error": record.last["valid_error"],
-            "ms_per_frame": predicted if measurement is None else measurement.ms_per_frame,
-            "measured": measurement is not None,
-            "num_parameters": record.config["num_parameters"],
-            "outcome": record.outcome,
-            "parameters": record.parameters,
-        }
+        return SearchPoint(
+            id=record.id,
+            stage=record.stage,
+            valid_error=record.last["valid_error"],
+            ms_per_frame=predicted if measurement is None else measurement.ms_per_frame,
+            measured=measurement is not None,
+            num_parameters=record.config["num_parameters"],
+            outcome=record.outcome,
+            parameters=record.parameters,
+        )
 
     points = [point(record) for record in records if record.last is not None]
-    return {"search_points": points, "cost_model": asdict(check)}
+    return points, CostModel.model_validate(asdict(check))

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from cconv.study.declared.configuration import configure, feature_path
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
+from cconv.study.records.found import Ablation, AblationStep, Found
 from cconv.study.stages.closed_form import fit_whole
 from cconv.study.stages.finalists import Finalist, Retrained, finalist_jobs, finalist_training, retrained_finalists
 from cconv.study.stages.jobs import train_all
@@ -28,8 +29,8 @@ class AblationStage(Stage):
     needs_records = True
     seeds: Whole = Field(1, ge=1, le=1000)
 
-    def run(self, session: Session, name: str) -> dict:
-        """Retrain the path and the toggled models; returns "ablation" with "of", "path" and "branches".
+    def run(self, session: Session, name: str) -> Found:
+        """Retrain the path and the toggled models; returns the ablation.
 
         A step of the path above the space's caps on cost is not trained and has no error.
         """
@@ -44,16 +45,13 @@ class AblationStage(Stage):
             _fit(session, name, branches, best.records[0].config["ridge"])
         else:
             self._train(session, name, path | branches)
-        return {
-            "ablation": {
-                "of": best.id,
-                "path": [_entry(session, name, change, each) for change, each in path.items()],
-                "branches": [
-                    _entry(session, name, branch, each) | {"left_out": branch, "of": _mean_error(best)}
-                    for branch, each in branches.items()
-                ],
-            }
-        }
+        ablation = Ablation(
+            of=best.id,
+            error=_mean_error(best),
+            path=[_step(session, name, change, each) for change, each in path.items()],
+            branches=[_step(session, name, branch, each) for branch, each in branches.items()],
+        )
+        return Found(ablation=ablation)
 
     def _train(self, session: Session, name: str, models: Mapping[str, dict]) -> None:
         """Train the models that the space's caps on cost allow."""
@@ -76,7 +74,7 @@ def _fit(session: Session, stage: str, models: Mapping[str, dict], ridge: float)
 
 def _finalists(session: Session, stage: str) -> list[Retrained]:
     names = [name for name in reads_of(session.study.stages, stage) if session.study.stages[name].kind == "finalists"]
-    ids = [each for name in names for each in session.run.result(name)["finalists"]]
+    ids = [each for name in names for each in session.run.result(name).finalists]
     return retrained_finalists(session.run, ids, session.study.finalists.seeds)[0]
 
 
@@ -111,18 +109,18 @@ def toggled(session: Session, best: Retrained) -> dict[str, dict]:
     return {name: parameters | {feature_path(name): name not in features} for name in offered}
 
 
-def _entry(session: Session, stage: str, change: str, parameters: Mapping) -> dict:
+def _step(session: Session, stage: str, change: str, parameters: Mapping) -> AblationStep:
     records = session.run.retrainings().get(f"{stage}_{change}", [])
     errors = [record.best for record in records if record.outcome == "completed"]
-    return {
-        "change": change,
-        "parameters": dict(parameters),
-        "valid_error": float(np.mean(errors)) if errors else None,
-        "low": min(errors, default=None),
-        "high": max(errors, default=None),
-        "flops_per_particle": records[0].config["flops_per_particle"] if records else None,
-        "num_parameters": records[0].config["num_parameters"] if records else None,
-    }
+    return AblationStep(
+        change=change,
+        parameters=parameters,
+        valid_error=float(np.mean(errors)) if errors else None,
+        low=min(errors, default=None),
+        high=max(errors, default=None),
+        flops_per_particle=records[0].config["flops_per_particle"] if records else None,
+        num_parameters=records[0].config["num_parameters"] if records else None,
+    )
 
 
 def _mean_error(finalist: Retrained) -> float:

@@ -3,6 +3,7 @@
 from typing import Literal
 
 from cconv.study.declared.stage import Stage
+from cconv.study.records.found import Found
 from cconv.study.stages.jobs import train_all, trial_job
 from cconv.study.stages.session import Session
 
@@ -12,7 +13,7 @@ class BaselineStage(Stage):
 
     kind: Literal["baseline"] = "baseline"
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Train the baseline once, with the seed of the searches."""
         train_all(session, name, [trial_job(session, name, 0, session.space.baseline)], session.study.training)
-        return {}
+        return Found()

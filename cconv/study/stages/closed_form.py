@@ -27,6 +27,7 @@ from cconv.study.declared.configuration import ARCHITECTURE, NETWORK, OPTIONAL_F
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
 from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
+from cconv.study.records.found import Found
 from cconv.study.records.trials import TrialFolder, TrialRecord, identity
 from cconv.study.running.problem import Problem, provenance
 from cconv.study.running.trial import Trial, describe
@@ -52,7 +53,7 @@ class ClosedFormStage(Stage):
     values_per_range: Whole = Field(3, ge=2, le=100)
     ridge: Ridge = 1e-10
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
 
         Half of them are drawn from all layers that the space holds, as many of each architecture; the others are
@@ -72,7 +73,7 @@ class ClosedFormStage(Stage):
                 _fit_and_record(session, layer, samples, folder, name, session.study.seeds.init, self.ridge)
                 number += 1
             batch = propose(self.winners(session, name), list(untried.values()))
-        return {}
+        return Found()
 
     def winners(self, session: Session, name: str) -> list[TrialRecord]:
         """The candidates so far that would become finalists, most accurate first."""

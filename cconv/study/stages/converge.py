@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 
 from cconv.study.declared.stage import Stage, reads_of
 from cconv.study.evidence.budget import still_falling
+from cconv.study.records.found import BudgetPoint, Convergence, Found
 from cconv.study.stages.finalists import Finalist, finalist_jobs, finalist_training, retrained_finalists
 from cconv.study.stages.jobs import train_all
 from cconv.study.stages.session import Session
@@ -43,14 +44,12 @@ class ConvergeStage(Stage):
         """Ids of the finalists that the stage asks for."""
         return self.of or ()
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Train the finalists that the stage names with its budgets, one after another.
 
         Returns:
-            "finalists", the hyperparameters of the longest training of each model, by an id that ends in its updates;
-            and "convergence", by model: "points", an entry a budget ("id", "updates", "valid_error", mean over
-            the seeds, "by_seed", "train_seconds"), and "still_falling", whether the last budget still lowered the
-            error.
+            The convergence of each model; and as finalists the longest training of each, by an id that ends in its
+            updates.
         """
         own = finalist_training(session.study).updates
         models = _named(_trained_finalists(session, name), self.of)
@@ -61,13 +60,15 @@ class ConvergeStage(Stage):
             for model, end in ends.items():
                 points[model].append(end)
             going = [model for model in ends if still_falling(points[model], session.study.selection.margin)]
-        return {
-            "finalists": {each[-1]["id"]: models[model] for model, each in points.items() if len(each) > 1},
-            "convergence": {model: {"points": each, "still_falling": model in going} for model, each in points.items()},
-        }
+        return Found(
+            finalists={each[-1].id: models[model] for model, each in points.items() if len(each) > 1},
+            convergence={
+                model: Convergence(points=each, still_falling=model in going) for model, each in points.items()
+            },
+        )
 
 
-def _train_with(session: Session, stage: str, models: Mapping[str, dict], updates: int) -> dict[str, dict]:
+def _train_with(session: Session, stage: str, models: Mapping[str, dict], updates: int) -> dict[str, BudgetPoint]:
     """Train models with a budget; returns the point of each whose trainings all finished."""
     study = session.study
     training = study.training.model_copy(update={"updates": updates})
@@ -82,7 +83,7 @@ def _trained_finalists(session: Session, stage: str) -> dict[str, dict]:
     retrainings = session.run.retrainings()
     found: dict[str, dict] = {}
     for name in reads_of(session.study.stages, stage):
-        found |= session.run.result(name)["finalists"]
+        found |= session.run.result(name).finalists
     return {name: each for name, each in found.items() if not retrainings[name][0].is_closed_form}
 
 
@@ -90,16 +91,16 @@ def _named(models: Mapping[str, dict], names: Sequence[str] | None) -> dict[str,
     return {name: each for name, each in models.items() if names is None or name in names}
 
 
-def _point(session: Session, finalist: str, updates: int) -> dict | None:
+def _point(session: Session, finalist: str, updates: int) -> BudgetPoint | None:
     """Mean validation error of a finalist's trainings with one budget; None if not all of them finished."""
     retrained, _ = retrained_finalists(session.run, [finalist], session.study.finalists.seeds)
     if not retrained:
         return None
     records, errors = retrained[0].records, retrained[0].valid_errors
-    return {
-        "id": finalist,
-        "updates": updates,
-        "valid_error": float(np.mean(errors)),
-        "by_seed": dict(zip([record.id for record in records], errors, strict=True)),
-        "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in records])),
-    }
+    return BudgetPoint(
+        id=finalist,
+        updates=updates,
+        valid_error=float(np.mean(errors)),
+        by_seed=dict(zip([record.id for record in records], errors, strict=True)),
+        train_seconds=float(np.mean([record.log[-1]["seconds"] for record in records])),
+    )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +20,9 @@ from cconv.study.declared.stage import BASELINE, Stage
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.evidence.budget import fall_at_the_end
 from cconv.study.evidence.recommendation import choose_finalists
+from cconv.study.records.found import Found
 from cconv.study.records.run_folder import RunFolder
+from cconv.study.records.summary import Errors, FinalistConfig, FinalistEntry, ModelCost, Stability, Units
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.trial_queue import Job, job_in
 from cconv.study.stages.closed_form import fit_closed_form_finalists
@@ -94,11 +96,8 @@ class FinalistsStage(Stage):
         """Hyperparameters of the configurations that the stage makes finalists, by the id that they get."""
         return self.include
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Retrain the baseline, named configurations and the best of the searches; fit the closed forms.
-
-        Returns:
-            "finalists": the hyperparameters of each, by id.
 
         Raises:
             StudyError: If none of them finished its training.
@@ -113,7 +112,7 @@ class FinalistsStage(Stage):
         train_all(session, FINALISTS, jobs, finalist_training(study))
         finalists = named | searched | closed
         check_any_finished(session.run, *retrained_finalists(session.run, finalists, study.finalists.seeds))
-        return {"finalists": finalists}
+        return Found(finalists=finalists)
 
     def _best_trials(self, session: Session, name: str) -> list[TrialRecord]:
         """The best trained configurations of the searches that the stage reads, the baseline's own left out."""
@@ -170,7 +169,7 @@ def retrained_finalists(
 
 def evaluate_finalist(
     finalist: Retrained, objective: Objective, samples: Sequence[Sample], frames_per_block: int
-) -> tuple[dict, np.ndarray]:
+) -> tuple[Errors, np.ndarray]:
     """Errors of a finalist on a split, over its seeds.
 
     Args:
@@ -180,52 +179,52 @@ def evaluate_finalist(
         frames_per_block: Frames of a unit where the split has a single trajectory.
 
     Returns:
-        What stands in summary.json, and the errors of each seed and unit (seeds, units).
+        The mean errors, and the errors of each seed and unit (seeds, units).
     """
     tables = [objective.table(load_model(each), samples, frames_per_block) for each in finalist.checkpoints]
     by_seed, per_frame = [table.error for table in tables], [table.per_frame for table in tables]
     units = np.stack([table.units for table in tables])
     mean = float(np.mean(by_seed))
     interval = crossed_interval(units)
-    facts = {
-        "normalized_mse": mean,
-        "relative_rmse": math.sqrt(mean),
-        "per_frame_normalized_mse": None if None in per_frame else float(np.mean(per_frame)),
-        "ci95": None if interval is None else [min(interval[0], mean), max(interval[1], mean)],
-        "why_no_interval": why_no_interval(*units.shape),
-        "by_seed": dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
-        "units": {"count": units.shape[1], "worst": float(units.mean(axis=0).max())},
-    }
+    facts = Errors(
+        normalized_mse=mean,
+        relative_rmse=math.sqrt(mean),
+        per_frame_normalized_mse=None if None in per_frame else float(np.mean(per_frame)),
+        ci95=None if interval is None else (min(interval[0], mean), max(interval[1], mean)),
+        why_no_interval=why_no_interval(*units.shape),
+        by_seed=dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
+        units=Units(count=units.shape[1], worst=float(units.mean(axis=0).max())),
+    )
     return facts, units
 
 
 def finalist_entry(
-    finalist: Retrained, valid: Mapping, test: Mapping, cost: Cost, stability: Mapping, run: RunFolder
-) -> dict:
+    finalist: Retrained, valid: Errors, test: Errors, cost: Cost, stability: Stability, run: RunFolder
+) -> FinalistEntry:
     """A finalist's entry in summary.json."""
     config = finalist.records[0].config
-    return {
-        "id": finalist.id,
-        "config": {"network": config["network"], "training": config["training"], "parameters": config["parameters"]},
-        "num_parameters": config["num_parameters"],
-        "updates": config["training"]["updates"],
-        "fall_at_the_end": fall_at_the_end(finalist.records),
-        "valid": dict(valid),
-        "test": dict(test),
-        "cost": asdict(cost),
-        "stability": dict(stability),
-        "checkpoint": str(finalist.best_checkpoint.relative_to(run.path)),
-        "train_seconds": float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
-    }
+    return FinalistEntry(
+        id=finalist.id,
+        config=FinalistConfig(network=config["network"], training=config["training"], parameters=config["parameters"]),
+        num_parameters=config["num_parameters"],
+        updates=config["training"]["updates"],
+        fall_at_the_end=fall_at_the_end(finalist.records),
+        valid=valid,
+        test=test,
+        cost=ModelCost.model_validate(cost, from_attributes=True),
+        stability=stability,
+        checkpoint=str(finalist.best_checkpoint.relative_to(run.path)),
+        train_seconds=float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
+    )
 
 
-def complete_cards(finalist: Retrained, test: Mapping, environment: Mapping) -> None:
+def complete_cards(finalist: Retrained, test: Errors, environment: Mapping) -> None:
     """Add test errors and provenance to the card beside each of a finalist's models."""
     for record, folder in zip(finalist.records, finalist.checkpoints, strict=True):
-        own = {"normalized_mse": test["by_seed"][record.id]}
+        own = {"normalized_mse": test.by_seed[record.id]}
         card = read_card(folder) | {
             "finalist": finalist.id,
-            "test": own | {"mean_over_seeds": test["normalized_mse"], "ci95": test["ci95"]},
+            "test": own | {"mean_over_seeds": test.normalized_mse, "ci95": test.ci95},
             "data_sha256": environment["data"]["sha256"],
             "git_commit": environment["git_commit"],
         }

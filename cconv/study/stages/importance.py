@@ -3,6 +3,7 @@
 from typing import Literal
 
 from cconv.study.declared.stage import Stage
+from cconv.study.records.found import Found
 from cconv.study.stages.session import Session
 
 SHOWN = 6  # parameters whose partial dependence is kept
@@ -15,13 +16,11 @@ class ImportanceStage(Stage):
     uses = ("random",)
     needs_records = True
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Estimate the importance at every rung, and the partial dependence of the error on the strongest parameters.
 
         A trial that is given up counts as one that learned nothing: errors count up to where trials are given up.
-
-        Returns:
-            "importance", an entry a rung; and "partial_dependence", an entry a parameter, if any rung says enough.
+        Without any rung that says enough there is no partial dependence.
         """
         from cconv.study.evidence.importance import importance_by_rung  # Optuna and scikit-learn: no reader of a study
         from cconv.study.evidence.partial_dependence import partial_dependence  # file shall wait for them
@@ -29,13 +28,13 @@ class ImportanceStage(Stage):
         records, space, seed = session.read(name), session.space, session.seed_of(name)
         useless = min(session.useless_error, session.study.search.give_up_above)
         importance = importance_by_rung(records, space, session.study.rungs, seed=seed, useless_error=useless)
-        first = next((entry for entry in importance if entry["parameters"]), None)  # the fewest trials had been stopped
+        first = next((entry for entry in importance if entry.parameters), None)  # the fewest trials had been stopped
         if first is None:
-            return {"importance": importance}
-        shares = {parameter: each["share"] or 0.0 for parameter, each in first["parameters"].items()}
+            return Found(importance=importance)
+        shares = {parameter: each.share or 0.0 for parameter, each in first.parameters.items()}
         strongest = sorted(shares, key=shares.__getitem__, reverse=True)[:SHOWN]
         dependences = [
-            partial_dependence(records, space, first["updates"], parameter, seed=seed, useless_error=useless)
+            partial_dependence(records, space, first.updates, parameter, seed=seed, useless_error=useless)
             for parameter in strongest
         ]
-        return {"importance": importance, "partial_dependence": dependences}
+        return Found(importance=importance, partial_dependence=dependences)

@@ -12,6 +12,7 @@ from cconv.study.declared.stage import MOST_TRIALS, Stage
 from cconv.study.evidence.rung_audit import audit_rungs
 from cconv.study.evidence.seed_variance import variance_decomposition
 from cconv.study.evidence.strategies import compare_strategies, learning_curves
+from cconv.study.records.found import Found
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.sampling import random_parameters
@@ -31,18 +32,18 @@ class InitializationStage(Stage):
     seeds: Whole = Field(5, ge=2, le=1000)
     configurations: Whole = Field(16, ge=2, le=MOST_TRIALS)
 
-    def run(self, session: Session, name: str) -> dict:
-        """Train them; returns "initialization", the two variances; "rung_audit" and "strategies", from the curves."""
+    def run(self, session: Session, name: str) -> Found:
+        """Train them; returns the two variances, the audit of the rungs, and the replayed strategies."""
         study, seed = session.study, session.seed_of(name)
         train_all(session, name, self._jobs(session, name), study.training)
         seeds, configurations = by_purpose(session.run, name, study.seeds.init)
         completed = [record for record in configurations if record.outcome == "completed"]
         factor = study.search.reduction_factor
-        return {
-            "initialization": variance_decomposition(seeds, configurations, study.rungs),
-            "rung_audit": audit_rungs(completed, study.rungs[:-1], kept=1 / factor),
-            "strategies": compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
-        }
+        return Found(
+            initialization=variance_decomposition(seeds, configurations, study.rungs),
+            rung_audit=audit_rungs(completed, study.rungs[:-1], kept=1 / factor),
+            strategies=compare_strategies(learning_curves(completed), study.rungs, factor, seed=seed),
+        )
 
     def _jobs(self, session: Session, name: str) -> list[Job]:
         study, space = session.study, session.space

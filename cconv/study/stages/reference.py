@@ -10,6 +10,7 @@ from typing import Literal
 
 from cconv.study.declared.stage import Stage, reads_of
 from cconv.study.evidence.strategies import best_so_far, spent_updates
+from cconv.study.records.found import Found, References, SearchStrategy
 from cconv.study.records.trials import TrialRecord
 from cconv.study.stages.jobs import train_all, trial_job
 from cconv.study.stages.session import Session
@@ -22,14 +23,11 @@ class ReferenceStage(Stage):
     uses = ("random", "adaptive")
     needs_records = True
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Train what ASHA stopped and the other rule would not have, and compare both at the same budget.
 
         Every trial of a search was measured at the first rung. What the search spent beyond that pays for the full
         training of the trials that are best there; those of them that ASHA stopped are trained to the end.
-
-        Returns:
-            "references", with "strategies", what each rule spent and found, and "asha_share", by search.
         """
         study, run = session.study, session.run
         read = {search: run.trials_of(search) for search in reads_of(study.stages, name)}
@@ -42,21 +40,21 @@ class ReferenceStage(Stage):
             strategies[f"{search}, ASHA"] = _by_asha(records)
             strategies[f"{search}, a little each"] = _by_first_rung(finals, len(records), study.rungs)
             shares[search] = spent_updates(records, study.training.updates)
-        return {"references": {"strategies": strategies, "asha_share": shares}}
+        return Found(references=References(strategies=strategies, asha_share=shares))
 
 
 def kept_at_same_budget(records: Sequence[TrialRecord], rungs: Sequence[int]) -> list[TrialRecord]:
     """Choose the trials that are best at the first rung: as many as the search could have trained to the end.
 
     Args:
-        records: All trials of the search.
+        records: All trials of the search, at least one.
         rungs: Updates of its rungs; the last one is the full budget.
 
     Returns:
         At least one of the trials that reached the first rung, if there is any, in the order of `records`.
     """
     first, full = rungs[0], rungs[-1]
-    spent = spent_updates(records, full)["updates"]
+    spent = spent_updates(records, full).updates
     count = max(1, int((spent - len(records) * first) // max(full - first, 1)))
     at_first = {record.id: error for record in records if (error := record.error_at(first)) is not None}
     best = sorted(at_first, key=at_first.__getitem__)[:count]
@@ -72,22 +70,22 @@ def _train_stopped(session: Session, stage: str, kept: Sequence[TrialRecord]) ->
     return {ids[record.id]: record for record in session.run.trials_of(stage) if record.id in ids}
 
 
-def _by_asha(records: Sequence[TrialRecord]) -> dict:
+def _by_asha(records: Sequence[TrialRecord]) -> SearchStrategy:
     """What the search itself spent and found."""
     curve = best_so_far(records)
-    return {
-        "updates": sum(record.log[-1]["updates"] for record in records if record.log),
-        "best_valid": curve[-1][1] if curve else None,
-        "curve": [list(point) for point in curve],
-    }
+    return SearchStrategy(
+        updates=sum(record.log[-1]["updates"] for record in records if record.log),
+        best_valid=curve[-1][1] if curve else None,
+        curve=curve,
+    )
 
 
-def _by_first_rung(finals: Sequence[TrialRecord], num_trials: int, rungs: Sequence[int]) -> dict:
+def _by_first_rung(finals: Sequence[TrialRecord], num_trials: int, rungs: Sequence[int]) -> SearchStrategy:
     """What the other rule spends and finds: each trial to the first rung, then the finals to the end, one by one."""
     spent, best, curve = num_trials * rungs[0], math.inf, []
     for record in finals:
         spent += rungs[-1] - rungs[0]
         if record.outcome == "completed" and record.last:
             best = min(best, record.last["valid_error"])
-            curve.append([spent, best])
-    return {"updates": spent, "best_valid": best if curve else None, "curve": curve}
+            curve.append((spent, best))
+    return SearchStrategy(updates=spent, best_valid=best if curve else None, curve=curve)

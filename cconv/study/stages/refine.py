@@ -4,6 +4,7 @@ from typing import Literal
 
 from cconv.study.declared.stage import Stage
 from cconv.study.evidence.narrowed_space import refine, write_space
+from cconv.study.records.found import Found
 from cconv.study.stages.session import Session
 
 
@@ -14,10 +15,10 @@ class RefineStage(Stage):
     uses = ("baseline", "initialization", "random")
     needs_records = True
 
-    def run(self, session: Session, name: str) -> dict:
-        """Write the narrowed space to ``stages/<name>.toml``; returns "refined", the reason for each parameter."""
+    def run(self, session: Session, name: str) -> Found:
+        """Write the narrowed space to ``stages/<name>.toml``; returns the reason for each parameter."""
         space, reasons = refine(session.space, session.read(name), session.study.training.updates)
         path = session.run.path / "stages" / f"{name}.toml"
         path.parent.mkdir(exist_ok=True)
         write_space(space, path)
-        return {"refined": reasons}
+        return Found(refined=reasons)

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 
 from cconv.study.declared.stage import Stage, Trials
+from cconv.study.records.found import Found
 from cconv.study.records.rungs import RungFile
 from cconv.study.running.trial_queue import Job, StopsByRungs, TrialQueue
 from cconv.study.stages.session import Session
@@ -29,7 +30,7 @@ class SearchStage(Stage):
     def jobs(self, session: Session, name: str) -> Iterator[Job]:
         """The trials of the search, each made when it is asked for."""
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Train the trials; those that ASHA stops are left where they are."""
         study = session.study
         file = RungFile(session.run.path / "rungs.json")
@@ -38,4 +39,4 @@ class SearchStage(Stage):
         session.observer.on_stage(name, self.trials, study.training.updates)
         queue = TrialQueue(self.jobs(session, name), study.training.updates, judge, session.observers(mirrored=True))
         session.start_pool().run(queue, name, study.training)
-        return {}
+        return Found()

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import Literal
@@ -15,15 +15,33 @@ from cconv.evaluation.checks import make_checks
 from cconv.evaluation.checks.material import make_material
 from cconv.evaluation.checks.predictor import ModelPredictor
 from cconv.evaluation.checks.stability import measure_stability
-from cconv.evaluation.cost import AnalyticCost, Cost, measure_costs, measure_growth
+from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.models.checkpoint import load_model
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.budget import budget_words
 from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
 from cconv.study.evidence.recommendation import Recommendation, recommend, retrained_error
+from cconv.study.records.found import Found, Parts
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.rungs import RungFile
+from cconv.study.records.summary import (
+    AnalyticCost,
+    ComparedModel,
+    DatasetFacts,
+    Errors,
+    FinalistEntry,
+    Front,
+    Growth,
+    MeanPredictor,
+    PassedRung,
+    Recommended,
+    Selection,
+    SizeTime,
+    Stability,
+    Summary,
+    TaskFacts,
+)
 from cconv.study.records.trials import count_outcomes
 from cconv.study.running.counted_costs import points_of_search
 from cconv.study.running.problem import study_samples
@@ -49,23 +67,21 @@ class SelectStage(Stage):
     uses = ("finalists", "converge")
     needs_records = True
 
-    def run(self, session: Session, name: str) -> dict:
+    def run(self, session: Session, name: str) -> Found:
         """Choose a finalist by validation errors, time and stability; then read the test split, once.
 
-        Writes summary.json; returns "recommended", the id of the finalist.
+        Writes summary.json; returns the id of the finalist.
 
         Raises:
             StudyError: If no finalist could be retrained.
         """
-        start = time.perf_counter()
-        summary = _summary(session, name)
-        seconds = _seconds_before(session, name) + time.perf_counter() - start
-        session.run.write("summary.json", summary | {"wall_seconds": seconds})
-        return {"recommended": summary["recommended"]["id"]}
+        summary = _summary(session, name, time.perf_counter())
+        session.run.write_summary(summary)
+        return Found(recommended=summary.recommended.id)
 
 
-def _summary(session: Session, stage: str) -> dict:
-    """Judge, test and explain the finalists; returns all of summary.json but the time that the study took."""
+def _summary(session: Session, stage: str, start: float) -> Summary:
+    """Judge, test and explain the finalists, in a stage that began at a time of the performance counter."""
     study, run = session.study, session.run
     finalists, failed = _finalists(session, stage)
     check_any_finished(run, finalists, failed)
@@ -73,33 +89,42 @@ def _summary(session: Session, stage: str) -> dict:
     growth = _growth(session, finalists)
     samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
     tests, test_errors = _errors(session, finalists, samples, "test errors")
-    _explain(run, [each for each in finalists if each.id in (BASELINE, judged.chosen.id)], samples)
+    explained = [each for each in finalists if each.id in (BASELINE, judged.chosen.id)]
+    _explain(run, explained, samples)
+    _complete_cards(run, finalists, tests)
+    mean, earlier = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
+    entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
+    points, cost_model = points_of_search(session.count_cost, run.trials(), judged.costs)
+    return Summary(
+        study=study.name,
+        task=_task(session),
+        dataset=_dataset(session, samples),
+        baseline=BASELINE,
+        checks=judged.checks,
+        mean_predictor=mean,
+        finalists=entries,
+        budget=budget_words(entries, earlier.convergence, study.selection.margin),
+        failed_finalists=failed,
+        pareto_front=timed_front({name: float(np.mean(e)) for name, e in judged.errors.items()}, judged.times),
+        front=_front(test_errors, judged.times, mean.test),
+        recommended=Recommended(id=judged.chosen.id, reason=judged.chosen.reason),
+        selection=_selection(judged, test_errors, study.selection.margin),
+        search_points=points,
+        cost_model=cost_model,
+        analytic=judged.analytic,
+        growth=growth,
+        explained=[each.id for each in explained],
+        trials=_counts(run),
+        rungs=_passed_rungs(session),
+        wall_seconds=_seconds_before(session, stage) + time.perf_counter() - start,
+        **earlier.found(),
+    )
+
+
+def _complete_cards(run: RunFolder, finalists: Sequence[Retrained], tests: Mapping[str, Errors]) -> None:
     environment = run.read("environment.json")
     for finalist in finalists:
         complete_cards(finalist, tests[finalist.id], environment)
-    trivial, found = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
-    entries = [_entry(each, judged, tests[each.id], run) for each in finalists]
-    return {
-        "study": study.name,
-        "task": study.task.name,
-        "dataset": _dataset(session, samples),
-        "baseline": BASELINE,
-        "checks": judged.checks,
-        "mean_predictor": trivial,
-        "finalists": entries,
-        "budget": budget_words(entries, found.get("convergence", {}), study.selection.margin),
-        "failed_finalists": failed,
-        "pareto_front": timed_front({name: float(np.mean(e)) for name, e in judged.errors.items()}, judged.times),
-        "front": _front(test_errors, judged.times, trivial["test"]),
-        "recommended": {"id": judged.chosen.id, "reason": judged.chosen.reason},
-        "selection": _selection(judged, test_errors, study.selection.margin),
-        **points_of_search(session.count_cost, run.trials(), judged.costs),
-        "analytic": asdict(judged.analytic),
-        "growth": growth,
-        "trials": _counts(run),
-        "rungs": _passed_rungs(session),
-        **found,
-    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +132,7 @@ class _Judged:
     """What the finalists are chosen by, none of it from the test split.
 
     Attributes:
-        facts: Validation errors of each, as they stand in the summary.
+        facts: Validation errors of each.
         errors: The same by (seeds, units).
         costs: Cost of each, and of some trials.
         analytic: Cost of the analytic field, timed in turn with them.
@@ -118,13 +143,13 @@ class _Judged:
         chosen: The recommendation by all seeds.
     """
 
-    facts: dict[str, dict]
+    facts: dict[str, Errors]
     errors: dict[str, np.ndarray]
     costs: dict[str, Cost]
     analytic: AnalyticCost
     times: dict[str, Timing]
     checks: dict[str, str]
-    stability: dict[str, dict]
+    stability: dict[str, Stability]
     choose: Callable[[Mapping[str, np.ndarray]], Recommendation]
     chosen: Recommendation
 
@@ -137,7 +162,7 @@ def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
     choose = partial(
         recommend,
         times=times,
-        failures={name: found["failures"] for name, found in stability.items()},
+        failures={name: found.failures for name, found in stability.items()},
         accurate_enough=settings.accurate_enough,
         margin=settings.margin,
     )
@@ -154,19 +179,19 @@ def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
     )
 
 
-def _entry(finalist: Retrained, judged: _Judged, test: Mapping, run: RunFolder) -> dict:
+def _entry(finalist: Retrained, judged: _Judged, test: Errors, run: RunFolder) -> FinalistEntry:
     facts, cost, stability = (each[finalist.id] for each in (judged.facts, judged.costs, judged.stability))
     return finalist_entry(finalist, facts, test, cost, stability, run)
 
 
 def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str, str]]:
-    ids = [each for name in reads_of(session.study.stages, stage) for each in session.run.result(name)["finalists"]]
+    ids = [each for name in reads_of(session.study.stages, stage) for each in session.run.result(name).finalists]
     return retrained_finalists(session.run, ids, session.study.finalists.seeds)
 
 
 def _errors(
     session: Session, finalists: Sequence[Retrained], samples: Sequence[Sample], label: str
-) -> tuple[dict[str, dict], dict[str, np.ndarray]]:
+) -> tuple[dict[str, Errors], dict[str, np.ndarray]]:
     """Errors of each finalist on a split, as facts and by (seeds, units)."""
     frames = session.study.finalists.frames_per_block
     both = {
@@ -176,13 +201,13 @@ def _errors(
     return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
 
 
-def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> dict[str, float]:
+def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> MeanPredictor:
     """What a model must be below on each split to know anything: the error of predicting the training mean there."""
-    problem = session.problem
-    splits = {"valid": problem.valid_samples, "test": test_samples}
-    return {
-        split: problem.objective.of_mean_predictor(samples, problem.train_samples) for split, samples in splits.items()
-    }
+    problem, objective = session.problem, session.problem.objective
+    return MeanPredictor(
+        valid=objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
+        test=objective.of_mean_predictor(test_samples, problem.train_samples),
+    )
 
 
 def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
@@ -194,7 +219,7 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
     chosen = [trials[place] for place in evenly_spaced(len(trials), settings.trials)] if trials else []
     checkpoints |= {record.id: run.trial(record.id).checkpoint for record in chosen}
     frames = list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
-    return measure_costs(
+    costs, analytic = measure_costs(
         checkpoints,
         load_model,
         frames,
@@ -203,9 +228,10 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
         threads=settings.threads,
         repeats=settings.repeats,
     )
+    return costs, AnalyticCost.model_validate(analytic, from_attributes=True)
 
 
-def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
+def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
     """Time of the finalists and of the analytic field on blocks of fluid of growing size."""
     settings = session.study.cost
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
@@ -218,15 +244,18 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> dict:
         threads=settings.threads,
         repeats=GROWTH_REPEATS,
     )
-    return {
-        "sizes": list(sizes),
-        "models": {name: [asdict(time) for time in growth.times] for name, growth in grown.items()},
-        "exponents": {name: growth.exponent for name, growth in grown.items() if math.isfinite(growth.exponent)},
-        "left_out": {name: list(growth.left_out) for name, growth in grown.items() if growth.left_out},
-    }
+    return Growth(
+        sizes=sizes,
+        models={
+            name: [SizeTime.model_validate(time, from_attributes=True) for time in growth.times]
+            for name, growth in grown.items()
+        },
+        exponents={name: growth.exponent for name, growth in grown.items() if math.isfinite(growth.exponent)},
+        left_out={name: growth.left_out for name, growth in grown.items() if growth.left_out},
+    )
 
 
-def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, str], dict[str, dict]]:
+def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, str], dict[str, Stability]]:
     """What each check of stability looks at, and what they found in every seed, all on validation trajectories.
 
     The test split is only looked at for its errors.
@@ -237,17 +266,16 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
     material = make_material(trajectories, scene, problem.task, reach)
     checks = make_checks(material)
     found = {
-        finalist.id: measure_stability(
-            {
-                record.id: ModelPredictor(load_model(checkpoint))
-                for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True)
-            },
-            checks,
-            material,
-        )
+        finalist.id: Stability(**measure_stability(_predictors(finalist), checks, material))
         for finalist in session.progress(finalists, "stability")
     }
     return {check.name: check.description() for check in checks}, found
+
+
+def _predictors(finalist: Retrained) -> dict[str, ModelPredictor]:
+    """Every training of a finalist as a predictor, by its name."""
+    trained = zip(finalist.records, finalist.checkpoints, strict=True)
+    return {record.id: ModelPredictor(load_model(checkpoint)) for record, checkpoint in trained}
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
@@ -262,56 +290,61 @@ def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[S
         np.savez_compressed(folder / f"{finalist.id}.npz", **arrays)
 
 
-def _selection(judged: _Judged, test_errors: Mapping[str, np.ndarray], margin: float) -> dict:
+def _selection(judged: _Judged, test_errors: Mapping[str, np.ndarray], margin: float) -> Selection:
     chosen = judged.chosen
     comparisons = [
-        {
-            "id": each.id,
-            "error": each.error,
-            "ms_per_frame": each.time.ms,
-            "ratio": each.to_best.ratio,
-            "log_standard_error": each.to_best.log_standard_error,
-            "ci95": each.to_best.ci95,
-            "within_one_se": each.within_one_se,
-            "non_inferior": each.non_inferior,
-            "accurate_enough": each.accurate_enough,
-            "stable": each.stable,
-            "eligible": each.eligible,
-            "why_not": each.why_not,
-        }
+        ComparedModel(
+            id=each.id,
+            error=each.error,
+            ms_per_frame=each.time.ms,
+            ratio=each.to_best.ratio,
+            log_standard_error=each.to_best.log_standard_error,
+            ci95=each.to_best.ci95,
+            within_one_se=each.within_one_se,
+            non_inferior=each.non_inferior,
+            accurate_enough=each.accurate_enough,
+            stable=each.stable,
+            eligible=each.eligible,
+            why_not=each.why_not,
+        )
         for each in chosen.comparisons
     ]
-    return {
-        "units": next(iter(judged.errors.values())).shape[1],
-        "margin": margin,
-        "best": chosen.best,
-        "tied": list(chosen.tied),
-        "by_rule": chosen.by_rule,
-        "comparisons": comparisons,
-        "retrained": retrained_error(judged.errors, test_errors, lambda errors: judged.choose(errors).id),
-    }
+    return Selection(
+        units=next(iter(judged.errors.values())).shape[1],
+        margin=margin,
+        best=chosen.best,
+        tied=chosen.tied,
+        by_rule=chosen.by_rule,
+        comparisons=comparisons,
+        retrained=retrained_error(judged.errors, test_errors, lambda errors: judged.choose(errors).id),
+    )
 
 
-def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst: float) -> dict:
+def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst: float) -> Front:
     """Test errors: attainment band over seeds, and the hypervolume up to the mean predictor at the slowest time."""
     milliseconds = {name: timing.ms for name, timing in times.items()}
-    band = attainment(errors, milliseconds)
-    corner = (worst, max(milliseconds.values()))
-    area = hypervolume_interval(errors, milliseconds, corner)
-    steps = zip(band["cost"], band["median"], band["low"], band["high"], strict=True)
-    return {
-        "attainment": [dict(zip(("ms_per_frame", "median", "low", "high"), step, strict=True)) for step in steps],
-        "hypervolume": area | {"reference": [corner[1], corner[0]]},
-    }
+    area = hypervolume_interval(errors, milliseconds, (worst, max(milliseconds.values())))
+    return Front(attainment=attainment(errors, milliseconds), hypervolume=area)
 
 
-def _dataset(session: Session, test_samples: Sequence[Sample]) -> dict:
+def _task(session: Session) -> TaskFacts:
+    task, objective = session.problem.task, session.problem.objective
+    return TaskFacts(
+        name=task.name,
+        symbol=task.symbol,
+        meaning=task.meaning,
+        error=objective.label,
+        error_meaning=objective.meaning,
+    )
+
+
+def _dataset(session: Session, test_samples: Sequence[Sample]) -> DatasetFacts:
     problem = session.problem
     frames = {"train": len(problem.train_samples), "valid": len(problem.valid_samples), "test": len(test_samples)}
-    return {"path": str(session.dataset.path), "scene": session.dataset.scene.name, "frames": frames}
+    return DatasetFacts(path=str(session.dataset.path), scene=session.dataset.scene.name, frames=frames)
 
 
-def _passed_rungs(session: Session) -> dict[str, list[dict]]:
+def _passed_rungs(session: Session) -> dict[str, list[PassedRung]]:
     """How many trials of each search went on from each rung."""
     study, file = session.study, RungFile(session.run.path / "rungs.json")
     factor = study.search.reduction_factor
@@ -325,14 +358,13 @@ def _counts(run: RunFolder) -> dict[str, dict[str, int]]:
 
 def _seconds_before(session: Session, stage: str) -> float:
     names = list(session.study.stages)
-    return sum(session.run.result(name)["seconds"] for name in names[: names.index(stage)])
+    return sum(session.run.result(name).seconds for name in names[: names.index(stage)])
 
 
-def _of_earlier_stages(session: Session, stage: str) -> Mapping:
+def _of_earlier_stages(session: Session, stage: str) -> Parts:
     """What the stages before this one have found, their own parts of the summary."""
     found: dict = {}
     names = list(session.study.stages)
     for name in names[: names.index(stage)]:
-        result = session.run.result(name)
-        found |= {key: value for key, value in result.items() if key not in ("kind", "seconds", "finalists", "spent")}
-    return found
+        found |= session.run.result(name).found()
+    return Parts(**found)

@@ -1,6 +1,8 @@
 import pytest
+from summaries import finalist
 
 from cconv.study.evidence.budget import budget_words, fall_at_the_end, still_falling
+from cconv.study.records.found import BudgetPoint, Convergence
 from cconv.study.records.trials import TrialRecord
 
 
@@ -15,7 +17,7 @@ def record(errors, every=10):
 
 
 def point(name, updates, error):
-    return {"id": name, "updates": updates, "valid_error": error}
+    return BudgetPoint(id=name, updates=updates, valid_error=error, by_seed={"seed_1": error}, train_seconds=1.0)
 
 
 def test_the_fall_is_that_of_the_best_error_in_the_last_quarter_of_the_updates():
@@ -39,25 +41,24 @@ def test_a_gain_within_the_margin_is_none(errors, falls):
 
 def test_the_words_name_both_budgets_and_whether_the_error_still_falls():
     ends = [point("baseline", 162, 0.57), point("baseline_after_6000", 6000, 0.166)]
-    found = {"baseline": {"points": ends, "still_falling": True}}
+    found = {"baseline": Convergence(points=ends, still_falling=True)}
     words = budget_words([], found, 0.05)
     assert "162 updates decided the error of baseline, 0.57: after 6,000 updates it is 0.166" in words
     assert "still falling" in words
-    assert "bring nothing" in budget_words([], {"baseline": {"points": ends, "still_falling": False}}, 0.05)
+    assert "bring nothing" in budget_words([], {"baseline": Convergence(points=ends, still_falling=False)}, 0.05)
 
 
 def test_a_finalist_whose_error_was_still_falling_is_named_unless_a_larger_budget_tells_more():
     entries = [
-        {"id": "baseline", "updates": 162, "fall_at_the_end": 0.2},
-        {"id": "fitted", "updates": 0, "fall_at_the_end": None},
-        {"id": "flat", "updates": 162, "fall_at_the_end": 0.01},
-        {"id": "steep", "updates": 162, "fall_at_the_end": 0.3},
+        finalist("baseline", updates=162, fall_at_the_end=0.2),
+        finalist("fitted", updates=0, fall_at_the_end=None),
+        finalist("flat", updates=162, fall_at_the_end=0.01),
+        finalist("steep", updates=162, fall_at_the_end=0.3),
     ]
     found = {
-        "baseline": {
-            "points": [point("baseline", 162, 0.5), point("baseline_after_600", 600, 0.4)],
-            "still_falling": False,
-        }
+        "baseline": Convergence(
+            points=[point("baseline", 162, 0.5), point("baseline_after_600", 600, 0.4)], still_falling=False
+        )
     }
     words = budget_words(entries, found, 0.05)
     assert "steep (by 30% in the last quarter of its 162 updates)" in words
@@ -67,4 +68,4 @@ def test_a_finalist_whose_error_was_still_falling_is_named_unless_a_larger_budge
 
 
 def test_nothing_is_said_where_no_budget_decided():
-    assert budget_words([{"id": "flat", "updates": 162, "fall_at_the_end": 0.0}], {}, 0.05) == ""
+    assert budget_words([finalist("flat", updates=162, fall_at_the_end=0.0)], {}, 0.05) == ""

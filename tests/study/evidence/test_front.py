@@ -1,7 +1,5 @@
 """Hypervolume and attainment: exact cases, laws, and a brute-force oracle."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -96,43 +94,43 @@ def test_the_area_agrees_with_points_thrown_at_random(rng):
 def test_the_interval_holds_the_hypervolume_and_closes_without_spread(models):
     errors, cost = models
     entry = hypervolume_interval(errors, cost, REFERENCE)
-    assert entry["ci95"][0] < entry["value"] < entry["ci95"][1]
-    assert json.loads(json.dumps(entry, allow_nan=False))["reference"] == [1.0, 100.0]
+    assert entry.ci95[0] < entry.value < entry.ci95[1]
+    assert entry.reference == (100.0, 1.0)
     still = {name: np.full((5, 4), table.mean()) for name, table in errors.items()}
     entry = hypervolume_interval(still, cost, REFERENCE)
-    assert entry["ci95"] == pytest.approx([entry["value"]] * 2)
-    assert entry["value"] == pytest.approx(hypervolume([(still[n].mean(), cost[n]) for n in still], REFERENCE))
+    assert entry.ci95 == pytest.approx([entry.value] * 2)
+    assert entry.value == pytest.approx(hypervolume([(still[n].mean(), cost[n]) for n in still], REFERENCE))
 
 
 def test_the_hypervolume_is_that_of_geometric_means_and_has_no_interval_for_few_units(models):
     errors, cost = models
     typical = [(np.exp(np.log(table).mean()), cost[name]) for name, table in errors.items()]
     few = hypervolume_interval({name: table[:, :3] for name, table in errors.items()}, cost, REFERENCE)
-    assert hypervolume_interval(errors, cost, REFERENCE)["value"] == pytest.approx(hypervolume(typical, REFERENCE))
-    assert few["ci95"] is None
-    assert "3 units" in few["why_no_interval"]
+    assert hypervolume_interval(errors, cost, REFERENCE).value == pytest.approx(hypervolume(typical, REFERENCE))
+    assert few.ci95 is None
+    assert "3 units" in few.why_no_interval
 
 
 def test_a_front_beyond_the_reference_dominates_nothing(models):
     errors, cost = models
     entry = hypervolume_interval({name: 100 * table for name, table in errors.items()}, cost, (0.1, 100.0))
-    assert (entry["value"], entry["ci95"]) == (0.0, [0.0, 0.0])
+    assert (entry.value, entry.ci95) == (0.0, (0.0, 0.0))
 
 
 def test_the_band_falls_with_cost_and_holds_its_median(models):
     band = attainment(*models)
-    assert band["cost"] == sorted(models[1].values())
-    low, median, high = (np.array(band[name]) for name in ("low", "median", "high"))
+    assert [step.ms_per_frame for step in band] == sorted(models[1].values())
+    low, median, high = np.array([(step.low, step.median, step.high) for step in band]).T
     assert (low <= median).all()
     assert (median <= high).all()
     assert all((np.diff(edge) <= 0).all() for edge in (low, median, high))
-    assert band["low"][0] == band["high"][0]  # a closed form has no seeds
+    assert band[0].low == band[0].high  # a closed form has no seeds
 
 
 def test_the_cheapest_model_attains_the_quantiles_of_its_own_seeds():
     errors = {"a": np.arange(1.0, 12.0)[:, None], "b": np.full((1, 1), 100.0)}
     band = attainment(errors, {"a": 1.0, "b": 2.0}, draws=20_000)
-    assert (band["low"], band["median"], band["high"]) == ([2.0, 2.0], [6.0, 6.0], [10.0, 10.0])
+    assert [(step.low, step.median, step.high) for step in band] == [(2.0, 6.0, 10.0)] * 2
 
 
 def test_models_without_cost_or_with_other_units_are_refused(models):

@@ -12,6 +12,7 @@ from cconv.study.evidence.effects import detectable_share
 from cconv.study.evidence.importance import importance_by_rung
 from cconv.study.evidence.partial_dependence import partial_dependence
 from cconv.study.evidence.surrogate import axes_of, coordinates, cross_validated_r2, trials_at
+from cconv.study.records.found import PartialDependence, RungImportance
 from cconv.study.records.trials import TrialRecord
 
 SPACE = SearchSpace(
@@ -60,24 +61,24 @@ def by_word_and_rate(each, updates, rng):
 
 def test_shares_of_variance_are_those_of_an_additive_error():
     entry = importance_by_rung(trials(200, by_word_and_rate), SPACE, [10], useless_error=1.0)[0]
-    judged = entry["parameters"]
+    judged = entry.parameters
     word, rate = 1.5**2 * (1 / 3) * (2 / 3), 0.6**2 * 3**2 / 12
     for name, share in (("word", word / (word + rate)), ("rate", rate / (word + rate))):
-        assert judged[name]["low"] < share < judged[name]["high"]
-        assert judged[name]["share"] == pytest.approx(share, abs=0.07)
-        assert judged[name]["f_anova"] == pytest.approx(share, abs=0.07)
-    assert [name for name in judged if judged[name]["decided"]] == ["word", "rate"]
-    assert entry["surrogate_r2"] > 0.9
+        assert judged[name].low < share < judged[name].high
+        assert judged[name].share == pytest.approx(share, abs=0.07)
+        assert judged[name].f_anova == pytest.approx(share, abs=0.07)
+    assert [name for name in judged if judged[name].decided] == ["word", "rate"]
+    assert entry.surrogate_r2 > 0.9
     assert set(judged) == {"word", "size", "rate", "count"}
-    assert json.loads(json.dumps(entry, allow_nan=False)) == entry
+    assert RungImportance(**json.loads(entry.model_dump_json())) == entry
 
 
 def test_what_the_best_have_in_common_is_important_by_ped_anova():
     records = trials(200, lambda each, updates, rng: -3 - (each["size"] == 8) + 0.1 * rng.normal())
     (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
-    found = {name: each["ped_anova"] for name, each in entry["parameters"].items()}
+    found = {name: each.ped_anova for name, each in entry.parameters.items()}
     assert max(found, key=found.__getitem__) == "size"
-    assert entry["best_share"] == 0.1
+    assert entry.best_share == 0.1
     assert sum(found.values()) == pytest.approx(1)
 
 
@@ -85,33 +86,33 @@ def test_where_nothing_decides_nothing_is_found():
     (entry,) = importance_by_rung(
         trials(60, lambda each, updates, rng: rng.normal() - 5), SPACE, [10], useless_error=1.0
     )
-    assert entry["surrogate_r2"] < 0.1
-    assert not any(each["decided"] for each in entry["parameters"].values())
-    assert all(each["low"] == 0 for each in entry["parameters"].values())
+    assert entry.surrogate_r2 < 0.1
+    assert not any(each.decided for each in entry.parameters.values())
+    assert all(each.low == 0 for each in entry.parameters.values())
 
 
 def test_the_detectable_share_is_that_of_the_hardest_hyperparameter():
     """A third value or a curve costs a degree of freedom more than a switch, so it must be stronger to be found."""
     (entry,) = importance_by_rung(trials(40, by_word_and_rate), SPACE, [10], useless_error=1.0)
-    assert entry["detectable_share"] == detectable_share(2, 40, 4)
+    assert entry.detectable_share == detectable_share(2, 40, 4)
 
 
 def test_a_hyperparameter_that_the_trials_do_not_vary_is_not_tested():
     records = trials(40, by_word_and_rate)
     records = [record(n, each.parameters | {"size": 4}, {10: each.error_at(10)}) for n, each in enumerate(records)]
     (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
-    size = entry["parameters"]["size"]
-    assert (size["share"], size["low"], size["high"], size["p_value"], size["decided"]) == (
+    size = entry.parameters["size"]
+    assert (size.share, size.low, size.high, size.p_value, size.decided) == (
         None,
         None,
         None,
         None,
         False,
     )
-    assert entry["detectable_share"] == detectable_share(2, 40, 3)
+    assert entry.detectable_share == detectable_share(2, 40, 3)
     same = [record(n, records[0].parameters, {10: each.error_at(10)}) for n, each in enumerate(records)]
     (entry,) = importance_by_rung(same, SPACE, [10], useless_error=1.0)
-    assert (entry["why_none"], entry["parameters"]) == ("no hyperparameter varies among the trials", {})
+    assert (entry.why_none, entry.parameters) == ("no hyperparameter varies among the trials", {})
 
 
 def test_rungs_are_never_mixed():
@@ -120,10 +121,10 @@ def test_rungs_are_never_mixed():
     )
     early, late = importance_by_rung(records, SPACE, [10, 30], useless_error=1.0)
     for entry, name in ((early, "size"), (late, "word")):
-        judged = entry["parameters"][name]
-        assert min(judged["share"], judged["f_anova"], judged["low"]) > 0.9
+        judged = entry.parameters[name]
+        assert min(judged.share, judged.f_anova, judged.low) > 0.9
     (entry,) = importance_by_rung(records, SPACE, [20], useless_error=1.0)
-    assert (entry["why_none"], entry["parameters"]) == ("0 trials were measured, and at least 10 are needed", {})
+    assert (entry.why_none, entry.parameters) == ("0 trials were measured, and at least 10 are needed", {})
 
 
 def test_a_rung_of_survivors_says_so_and_a_rung_of_few_has_no_importance():
@@ -131,12 +132,12 @@ def test_a_rung_of_survivors_says_so_and_a_rung_of_few_has_no_importance():
     stopped = [record(100 + n, drawn(np.random.default_rng(n)), {10: 0.5}, "stopped") for n in range(20)]
     few = [record(200 + n, each.parameters, {120: 0.5}) for n, each in enumerate(records[:9])]
     entries = importance_by_rung([*records, *stopped, *few], SPACE, [10, 30, 120], useless_error=1.0)
-    assert [(entry["updates"], entry["trials"], entry["censored"]) for entry in entries] == [
+    assert [(entry.updates, entry.trials, entry.censored) for entry in entries] == [
         (10, 60, False),
         (30, 40, True),
         (120, 9, True),
     ]
-    assert [bool(entry["parameters"]) for entry in entries] == [True, True, False]
+    assert [bool(entry.parameters) for entry in entries] == [True, True, False]
 
 
 def useless(count, error=50.0):
@@ -147,29 +148,29 @@ def useless(count, error=50.0):
 def test_where_most_trials_are_no_better_than_the_mean_there_is_no_importance(good, bad, is_given):
     records = [*trials(good, by_word_and_rate), *useless(bad)]
     (entry,) = importance_by_rung(records, SPACE, [10], useless_error=1.0)
-    assert entry["clipped"] == bad
-    assert bool(entry["parameters"]) == is_given
-    assert entry["why_none"].startswith("" if is_given else f"{bad} of {good + bad} trials are no better than")
-    assert (entry["detectable_share"] is None) == (not is_given)
+    assert entry.clipped == bad
+    assert bool(entry.parameters) == is_given
+    assert entry.why_none.startswith("" if is_given else f"{bad} of {good + bad} trials are no better than")
+    assert (entry.detectable_share is None) == (not is_given)
 
 
 def test_equal_errors_have_no_importance():
     (entry,) = importance_by_rung(useless(20, error=0.5), SPACE, [10], useless_error=1.0)
-    assert (entry["why_none"], entry["parameters"]) == ("all errors are equal", {})
+    assert (entry.why_none, entry.parameters) == ("all errors are equal", {})
 
 
 def test_a_trial_that_was_given_up_on_the_way_counts_as_clipped():
     """`give_up_above` is 0.8 here, below what predicting the mean scores: errors count up to it."""
     given_up = [record(300 + n, drawn(np.random.default_rng(n)), {7: 0.9}, "stopped") for n in range(30)]
     (entry,) = importance_by_rung([*trials(20, by_word_and_rate), *given_up], SPACE, [10], useless_error=0.8)
-    assert (entry["trials"], entry["clipped"], entry["censored"]) == (50, 30, False)
-    assert "were given up" in entry["why_none"]
+    assert (entry.trials, entry.clipped, entry.censored) == (50, 30, False)
+    assert "were given up" in entry.why_none
 
 
 def test_a_trial_that_ran_out_of_time_on_the_way_makes_the_rung_a_selection():
     slow = record(300, drawn(np.random.default_rng(0)), {7: 0.01}, "stopped")
     (entry,) = importance_by_rung([*trials(20, by_word_and_rate), slow], SPACE, [10], useless_error=1.0)
-    assert (entry["trials"], entry["censored"]) == (20, True)
+    assert (entry.trials, entry.censored) == (20, True)
 
 
 def test_a_diverged_trial_counts_as_useless_at_the_rung_on_whose_way_it_diverged():
@@ -216,17 +217,15 @@ def test_a_surrogate_of_noise_does_not_predict():
 def test_partial_dependence_follows_an_additive_error():
     records = trials(150, by_word_and_rate)
     found = partial_dependence(records, SPACE, 10, "word", useless_error=1.0)
-    assert found["values"] == ["a", "b", "c"]
-    rise = np.log10(found["error"][1]) - np.log10(found["error"][0])
+    assert found.values == ("a", "b", "c")
+    rise = np.log10(found.error[1]) - np.log10(found.error[0])
     assert rise == pytest.approx(1.5, abs=0.15)
-    assert all(
-        low <= error <= high for low, error, high in zip(found["low"], found["error"], found["high"], strict=True)
-    )
-    assert len(found["points"]) == found["trials"] == 150
+    assert all(low <= error <= high for low, error, high in zip(found.low, found.error, found.high, strict=True))
+    assert len(found.points) == found.trials == 150
     by_rate = partial_dependence(records, SPACE, 10, "rate", useless_error=1.0)
-    slope = np.polyfit(np.log10(by_rate["values"]), np.log10(by_rate["error"]), 1)[0]
+    slope = np.polyfit(np.log10(by_rate.values), np.log10(by_rate.error), 1)[0]
     assert slope == pytest.approx(0.6, abs=0.1)
-    assert json.loads(json.dumps(by_rate)) == by_rate
+    assert PartialDependence(**json.loads(by_rate.model_dump_json())) == by_rate
 
 
 def test_partial_dependence_refuses_what_it_cannot_show():
@@ -242,4 +241,4 @@ def test_where_ties_make_all_trials_the_best_none_of_them_differs_from_all():
     tied = useless(23, error=0.5)
     best = record(23, drawn(np.random.default_rng(23)), {10: 0.1})
     (entry,) = importance_by_rung([*tied, best], SPACE, [10], useless_error=1.0)
-    assert all(judged["ped_anova"] == 0 for judged in entry["parameters"].values())
+    assert all(judged.ped_anova == 0 for judged in entry.parameters.values())

@@ -8,6 +8,7 @@ import pytest
 from cconv.errors import DataError
 from cconv.study.evidence.front import Timing
 from cconv.study.evidence.recommendation import choose_finalists, recommend, retrained_error
+from cconv.study.records.summary import ExpectedError
 from cconv.study.records.trials import TrialRecord
 
 
@@ -199,13 +200,13 @@ def draw_study(rng, models=4, seeds=5, units=5):
             rng.normal(0, spreads["cell"], (models, seeds, units)),
         )
         errors = typical[:, None, None] * np.exp(of_seed + sum(effects))
-        return {f"model {number}": table for number, table in enumerate(errors)}
+        return {f"model_{number}": table for number, table in enumerate(errors)}
 
     networks = {
-        f"model {number}": value * over_units for number, value in enumerate(typical * np.exp(of_seed).mean((1, 2)))
+        f"model_{number}": value * over_units for number, value in enumerate(typical * np.exp(of_seed).mean((1, 2)))
     }
     retrained = {
-        f"model {number}": value * over_units * math.exp(spreads["seed"] ** 2 / 2)
+        f"model_{number}": value * over_units * math.exp(spreads["seed"] ** 2 / 2)
         for number, value in enumerate(typical)
     }
     return split(), split(), networks, retrained
@@ -214,7 +215,7 @@ def draw_study(rng, models=4, seeds=5, units=5):
 def test_what_is_chosen_by_validation_is_reported_without_bias():
     """Chosen by the test split, the error is reported too small; a retraining loses the luck of the seeds as well."""
     rng, studies = np.random.default_rng(0), 200
-    alike = {f"model {number}": Timing((1.0,) * 20) for number in range(4)}
+    alike = {f"model_{number}": Timing((1.0,) * 20) for number in range(4)}
     reported = {name: [] for name in ("by test", "by validation", "as if retrained", "retrained")}
 
     def choose(errors):
@@ -223,11 +224,11 @@ def test_what_is_chosen_by_validation_is_reported_without_bias():
     for _ in range(studies):
         valid, test, networks, retrainings = draw_study(rng)
         by_test, by_validation, anew = choose(test), choose(valid), retrained_error(valid, test, choose)
-        truth = np.average([retrainings[name] for name in anew["choices"]], weights=[*anew["choices"].values()])
+        truth = np.average([retrainings[name] for name in anew.choices], weights=[*anew.choices.values()])
         reported["by test"].append((test[by_test].mean(), networks[by_test]))
         reported["by validation"].append((test[by_validation].mean(), networks[by_validation]))
         reported["as if retrained"].append((test[by_validation].mean(), retrainings[by_validation]))
-        reported["retrained"].append((anew["normalized_mse"], truth))
+        reported["retrained"].append((anew.normalized_mse, truth))
     ratio = {name: np.divide(*np.mean(pairs, axis=0)) for name, pairs in reported.items()}
     chance = {name: bootstrap_error(np.array(pairs), rng) for name, pairs in reported.items()}
     assert ratio["by validation"] == pytest.approx(1, abs=3 * chance["by validation"])
@@ -250,5 +251,7 @@ def test_the_error_of_a_retraining_is_that_of_the_seed_that_did_not_choose():
     def choose(errors):
         return min(errors, key=lambda name: errors[name].mean())
 
-    assert retrained_error(valid, test, choose) == {"normalized_mse": (100 + 20 + 30) / 3, "choices": {"b": 1, "a": 2}}
+    assert retrained_error(valid, test, choose) == ExpectedError(
+        normalized_mse=(100 + 20 + 30) / 3, choices={"b": 1, "a": 2}
+    )
     assert retrained_error({"a": np.ones((1, 4))}, {"a": np.ones((1, 4))}, choose) is None

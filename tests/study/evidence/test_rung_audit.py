@@ -1,12 +1,10 @@
 """Rung audit: measures that agree with scipy, laws of what they mean, and verdicts on known curves."""
 
-import json
-
 import numpy as np
 import pytest
 import scipy.stats
 
-from cconv.study.evidence.rung_audit import MEASURES, audit_rungs, rung_measures, spearman_interval
+from cconv.study.evidence.rung_audit import audit_rungs, rung_measures, spearman_interval
 from cconv.study.records.trials import TrialRecord
 
 
@@ -69,32 +67,30 @@ def test_equal_errors_have_no_correlation():
 
 def test_a_survivor_of_asha_is_counted(rng):
     (entry,) = audit_rungs(trials(rng, 0.0, count=30), [10], kept=1 / 3)
-    assert (entry["top"], entry["survival"], entry["recall"]) == (3, 1.0, 1.0)
-    assert audit_rungs(trials(rng, 0.0, count=60), [10])[0]["top"] == 6
+    assert (entry.top, entry.survival, entry.recall) == (3, 1.0, 1.0)
+    assert audit_rungs(trials(rng, 0.0, count=60), [10])[0].top == 6
 
 
 @pytest.mark.parametrize(("noise", "verdict"), [(0.01, "reliable"), (5.0, "unreliable")])
 def test_the_verdict_follows_the_noise(rng, noise, verdict):
     (entry,) = audit_rungs(trials(rng, noise), [10])
-    low, high = entry["spearman_ci95"]
-    assert entry["verdict"] == verdict
-    assert low <= entry["spearman"] <= high
-    assert entry["why_no_interval"] == ""
-    assert set(MEASURES) <= set(entry)
-    json.dumps(entry, allow_nan=False)
+    low, high = entry.spearman_ci95
+    assert entry.verdict == verdict
+    assert low <= entry.spearman <= high
+    assert entry.why_no_interval == ""
 
 
 @pytest.mark.parametrize("count", [2, 3, 6, 11])
 def test_few_trials_leave_the_verdict_undecided_and_have_no_interval(rng, count):
     (entry,) = audit_rungs(trials(rng, 0.25, count=count), [10])
-    assert (entry["verdict"], entry["trials"], entry["spearman_ci95"]) == ("undecided", count, None)
-    assert entry["why_no_interval"] == f"{count} trials, and at least 12 are needed"
-    assert (entry["spearman"] is None) == (count < 4)
+    assert (entry.verdict, entry.trials, entry.spearman_ci95) == ("undecided", count, None)
+    assert entry.why_no_interval == f"{count} trials, and at least 12 are needed"
+    assert (entry.spearman is None) == (count < 4)
 
 
 def test_equal_errors_are_undecided():
     (entry,) = audit_rungs([trial(number, {10: 1.0, 90: 0.1}) for number in range(20)], [10])
-    assert (entry["verdict"], entry["why_no_interval"]) == ("undecided", "all errors are equal")
+    assert (entry.verdict, entry.why_no_interval) == ("undecided", "all errors are equal")
 
 
 def test_an_interval_is_wide_for_few_trials_even_where_the_order_is_the_same():

@@ -1,7 +1,5 @@
 """Variance decomposition: spreads are what they say; evaluation/test_coverage.py says how often intervals hold."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -23,12 +21,11 @@ def test_each_rung_compares_what_reached_it():
     seeds = [trial(number, {10: 0.1 * 10**number, 30: 0.01}) for number in range(2)]
     configurations = [trial(0, {10: 1.0, 30: 0.1}), trial(1, {10: 100.0, 30: 0.001}), trial(2, {10: None})]
     first, second = variance_decomposition(seeds, configurations, [10, 30, 90])
-    assert (first["updates"], first["seeds"], first["configurations"]) == (10, 2, 2)
-    assert first["seed_spread"] == pytest.approx(np.sqrt(0.5))
-    assert first["configuration_spread"] == pytest.approx(np.sqrt(2))
-    assert first["seed_share"] == pytest.approx(0.25)
-    assert (second["seed_share"], first["seed_share_ci95"], second["seed_share_ci95"]) == (0.0, None, None)
-    json.dumps([first, second], allow_nan=False)
+    assert (first.updates, first.seeds, first.configurations) == (10, 2, 2)
+    assert first.seed_spread == pytest.approx(np.sqrt(0.5))
+    assert first.configuration_spread == pytest.approx(np.sqrt(2))
+    assert first.seed_share == pytest.approx(0.25)
+    assert (second.seed_share, first.seed_share_ci95, second.seed_share_ci95) == (0.0, None, None)
 
 
 def test_no_seeds_no_entries():

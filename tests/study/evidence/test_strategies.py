@@ -1,7 +1,5 @@
 """Replayed strategies: counts by hand, what they have in common, and an oracle of Ray's rule."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -13,6 +11,7 @@ from cconv.study.evidence.strategies import (
     replay_little_each,
     spent_updates,
 )
+from cconv.study.records.found import SpentUpdates
 from cconv.study.records.trials import TrialRecord
 
 RUNGS = [10, 30, 90]
@@ -77,14 +76,13 @@ def test_a_little_of_each_counts_by_hand():
 def test_what_stops_spends_less_and_finds_no_better(curves):
     entries = compare_strategies(curves, RUNGS, 3, draws=100)
     asha, *little, everything = entries
-    assert (everything["strategy"], everything["share"], everything["regret"]) == ("no_stopping", 1.0, 1.0)
-    assert [entry["updates_each"] for entry in little] == RUNGS[:-1]
+    assert (everything.strategy, everything.share, everything.regret) == ("no_stopping", 1.0, 1.0)
+    assert [entry.updates_each for entry in little] == RUNGS[:-1]
     for entry in [asha, *little]:
-        assert entry["share"] < 1
-        assert entry["regret"] >= 1
-        assert entry["regret_range95"][0] >= 1
-    assert little[0]["share"] <= asha["share"]
-    json.dumps(entries, allow_nan=False)
+        assert entry.share < 1
+        assert entry.regret >= 1
+        assert entry.regret_range95[0] >= 1
+    assert little[0].share <= asha.share
 
 
 def test_curves_that_were_not_measured_at_every_rung_do_not_count(curves):
@@ -101,8 +99,7 @@ def test_curves_are_those_of_completed_trials_with_finite_errors():
 
 def test_every_update_that_was_spent_counts():
     records = [trial("a", [(10, 0.5), (90, 0.2)]), trial("b", [(10, 0.1)], "stopped"), trial("c", [], "failed")]
-    assert spent_updates(records, 90) == {"updates": 100, "full_updates": 270, "share": 100 / 270}
-    assert spent_updates([], 90)["share"] is None
+    assert spent_updates(records, 90) == SpentUpdates(updates=100, full_updates=270, share=100 / 270)
 
 
 def test_the_best_so_far_falls_and_only_completed_trials_lower_it():

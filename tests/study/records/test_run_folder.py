@@ -1,9 +1,11 @@
 import json
 
 import pytest
+from summaries import SAMPLE, whole_summary
 
 from cconv.errors import ConfigError, DataError
-from cconv.files import write_json
+from cconv.files import read_json, write_json
+from cconv.study.records.found import Found, StageResult
 from cconv.study.records.run_folder import FORMAT, RunFolder
 
 CONFIG = {
@@ -19,6 +21,7 @@ ENVIRONMENT = {
     "packages": {"torch": "2.13.0"},
     "seeds": {"data": 0, "init": 0, "search": 0},
     "data": {"sha256": "0"},
+    "data_findings": [],
 }
 ENTRY = {"updates": 5, "train_loss": 1.0, "valid_error": 0.5, "learning_rate": 1e-3, "seconds": 1.0}
 
@@ -89,7 +92,7 @@ def test_what_is_no_run_folder_is_named(tmp_path):
 def test_damaged_json_is_named(tmp_path):
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(DataError, match=r"summary\.json: not JSON"):
-        RunFolder(tmp_path).read("summary.json")
+        RunFolder(tmp_path).summary()
 
 
 def test_a_run_folder_of_another_format_is_refused(tmp_path):
@@ -195,9 +198,6 @@ def test_a_record_that_does_not_fit_is_named_with_its_key(name, content, message
         ("state.json", {"state": 5, "stage": "random"}, "`state`"),
         ("rungs.json", {"random": {"updates": 5}}, "`random`: input should be a valid list"),
         ("rungs.json", {"random": [{"updates": 5, "recorded": {"a": "b"}}]}, "`random.0.recorded.a`"),
-        ("stages/random.json", {"kind": "random"}, "`seconds` is missing"),
-        ("stages/finalists.json", {"kind": "f", "seconds": 1.0, "finalists": {"../x": {}}}, "a name must match"),
-        ("summary.json", {"study": "s"}, "is missing"),
         ("environment.json", [1], "valid dictionary"),
         ("environment.json", ENVIRONMENT | {"packages": ["torch"]}, "`packages`"),
         ("environment.json", ENVIRONMENT | {"data_findings": ["suspicious"]}, "`data_findings.0`"),
@@ -208,6 +208,63 @@ def test_a_file_of_the_run_that_does_not_fit_is_named_with_its_key(name, content
     with pytest.raises(DataError, match=message) as refused:
         RunFolder(tmp_path).read(name)
     assert str(tmp_path / name) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"kind": "random"}, "`seconds` is missing"),
+        ({"kind": "f", "seconds": 1.0, "finalists": {"../x": {}}}, "a name must match"),
+        ({"kind": "f", "seconds": 1.0, "refinde": {}}, "unknown key `refinde`. Did you mean 'refined'"),
+        ({"kind": "f", "seconds": 1.0, "references": {"strategies": 5, "asha_share": {}}}, "`references.strategies`"),
+    ],
+)
+def test_a_result_that_does_not_fit_is_named_with_its_key(content, message, tmp_path):
+    write_json(tmp_path / "stages" / "f.json", content)
+    with pytest.raises(DataError, match=rf"f\.json: .*{message}"):
+        RunFolder(tmp_path).result("f")
+
+
+def test_a_stage_is_read_as_it_was_written_with_what_it_found_and_no_more(tmp_path):
+    run, found = RunFolder(tmp_path), Found(refined={"layers": "1 or 2"})
+    run.write_result("narrow", "refine", 2.5, found)
+    assert read_json(tmp_path / "stages" / "narrow.json").keys() == {"kind", "seconds", "refined"}
+    assert run.result("narrow") == StageResult(kind="refine", seconds=2.5, refined={"layers": "1 or 2"})
+    assert run.result("narrow").found() == found.found() == {"refined": {"layers": "1 or 2"}}
+
+
+def test_a_summary_is_read_as_it_was_written(tmp_path):
+    summary, run = whole_summary(RunFolder(SAMPLE).summary()), RunFolder(tmp_path)
+    run.write_summary(summary)
+    assert run.summary() == summary
+
+
+def without(key):
+    return lambda content: content.pop(key)
+
+
+def negative_error(content):
+    content["finalists"][1]["test"]["normalized_mse"] = -1.0
+
+
+def misspelt(content):
+    content["selection"]["tide"] = content["selection"].pop("tied")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (without("study"), "`study` is missing"),
+        (negative_error, r"`finalists\.1\.test\.normalized_mse`: .* greater than or equal to 0, got -1"),
+        (misspelt, r"unknown key `selection\.tide`\. Did you mean 'tied'"),
+    ],
+)
+def test_a_summary_that_does_not_fit_is_named_with_its_key(damage, message, tmp_path):
+    content = read_json(SAMPLE / "summary.json")
+    damage(content)
+    write_json(tmp_path / "summary.json", content)
+    with pytest.raises(DataError, match=rf"summary\.json: {message}"):
+        RunFolder(tmp_path).summary()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from ray.tune.schedulers import ASHAScheduler
 
 from cconv.study.declared.study_file import rungs_up_to
 from cconv.study.records.rungs import RungFile, RungTable
+from cconv.study.records.summary import PassedRung
 
 
 def curves(seed, count=60, full=27):
@@ -77,7 +78,7 @@ def test_those_that_passed_a_rung_are_those_that_went_on_beyond_it(tmp_path, see
     table = RungTable(rungs, factor)
     run(table, curves(seed))
     reached = {entry["updates"]: set(entry["recorded"]) for entry in table.entries()}
-    counts = {entry["updates"]: (entry["trials"], entry["passed"]) for entry in table.passed()}
+    counts = {rung.updates: (rung.trials, rung.passed) for rung in table.passed()}
     assert counts == {
         rung: (len(reached[rung]), len(reached[later])) for rung, later in zip(rungs[:-1], rungs[1:], strict=True)
     }
@@ -90,7 +91,7 @@ def test_a_rung_that_no_trial_reached_has_no_share_and_asking_records_nothing():
     assert table.passed() == []
     table.record("first", 3, 1.0)
     before = table.entries()
-    assert table.passed() == [{"updates": 3, "trials": 1, "passed": 1}]
+    assert table.passed() == [PassedRung(updates=3, trials=1, passed=1)]
     assert table.entries() == before
 
 

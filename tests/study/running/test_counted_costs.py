@@ -54,14 +54,13 @@ def test_times_that_follow_from_the_count_are_found_again(generator):
     records = [record(number, parameters) for number, parameters in enumerate(PARAMETERS)]
     truth = [1.0 + 1e-3 * count(each).flops_per_particle + 1e-4 * count(each).bytes_per_particle for each in PARAMETERS]
     measured = {each.id: cost(time) for each, time in list(zip(records, truth, strict=True))[::2]}
-    found = points_of_search(count, records, measured)
-    points = found["search_points"]
-    assert [point["measured"] for point in points] == [number % 2 == 0 for number in range(len(records))]
-    assert np.allclose([point["ms_per_frame"] for point in points], 0.064 * np.array(truth), rtol=1e-6)
-    assert found["cost_model"]["median_relative_error"] < 1e-6
+    points, cost_model = points_of_search(count, records, measured)
+    assert [point.measured for point in points] == [number % 2 == 0 for number in range(len(records))]
+    assert np.allclose([point.ms_per_frame for point in points], 0.064 * np.array(truth), rtol=1e-6)
+    assert cost_model.median_relative_error < 1e-6
 
 
 def test_few_measured_models_predict_nothing(generator):
     count = CostCounter(STUDY, problem(generator))
     records = [record(number, parameters) for number, parameters in enumerate(PARAMETERS)]
-    assert points_of_search(count, records, {records[0].id: cost(1.0)}) == {}
+    assert points_of_search(count, records, {records[0].id: cost(1.0)}) == ([], None)

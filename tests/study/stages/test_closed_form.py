@@ -140,17 +140,17 @@ def run(finished_run):
 def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_folder):
     screened = [record for record in run.trials() if record.stage == "closed_form"]
     best = min(screened, key=lambda record: record.last["valid_error"])
-    entry = next(entry for entry in run.read("summary.json")["finalists"] if entry["id"] == best.id)
-    (record,) = run.retrainings()[entry["id"]]
+    entry = run.summary().finalist(best.id)
+    (record,) = run.retrainings()[entry.id]
     assert record.is_closed_form
-    model = load_model(run.path / entry["checkpoint"])
+    model = load_model(run.path / entry.checkpoint)
     samples = list(iterate_samples(open_dataset(flow_folder), "test", model.task))
-    assert entry["test"]["normalized_mse"] == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
-    assert list(entry["test"]["by_seed"]) == [record.id]
-    assert "1 unit says too little of others" in entry["test"]["why_no_interval"]
-    card = json.loads((run.path / entry["checkpoint"] / "card.json").read_text())
+    assert entry.test.normalized_mse == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
+    assert list(entry.test.by_seed) == [record.id]
+    assert "1 unit says too little of others" in entry.test.why_no_interval
+    card = json.loads((run.path / entry.checkpoint / "card.json").read_text())
     assert card["closed_form"]
-    assert card["test"]["ci95"] is entry["test"]["ci95"] is None
+    assert card["test"]["ci95"] is entry.test.ci95 is None
 
 
 @pytest.mark.parametrize(

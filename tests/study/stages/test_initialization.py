@@ -28,7 +28,7 @@ def test_nothing_was_stopped(run):
 
 def test_the_summary_holds_what_the_records_say(run):
     seeds, configurations = by_purpose(run, "initialization", 0)
-    summary = run.read("summary.json")
-    assert summary["initialization"] == variance_decomposition(seeds, configurations, [6, 18])
-    assert [entry["updates"] for entry in summary["rung_audit"]] == [6]
-    assert {entry["strategy"] for entry in summary["strategies"]} == {"asha", "little_each", "no_stopping"}
+    summary = run.summary()
+    assert list(summary.initialization) == variance_decomposition(seeds, configurations, [6, 18])
+    assert [entry.updates for entry in summary.rung_audit] == [6]
+    assert {entry.strategy for entry in summary.strategies} == {"asha", "little_each", "no_stopping"}

@@ -27,7 +27,7 @@ def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
     )
     checks, found = _stress(session, [finalist])
     assert list(checks) == list(given.task.checks)
-    assert found["baseline"]["counts"]["seeds"] == 2
-    precise = [line for line in found["baseline"]["failures"] if "float32" in line]
+    assert found["baseline"].counts.seeds == 2
+    precise = [line for line in found["baseline"].failures if "float32" in line]
     assert len(precise) == 1
     assert "seeds baseline/seed_2 of 2" in precise[0]

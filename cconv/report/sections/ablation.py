@@ -1,0 +1,19 @@
+"""What each change between the baseline and the best model brings."""
+
+from typing import Any
+
+from cconv.report.plots import ablation_chart
+from cconv.report.sections.section import Records, Section
+from cconv.study.records.summary import Summary
+
+
+class AblationSection(Section):
+    """Models trained anew with one change after the other, and with one part more or less."""
+
+    name = "ablation"
+    title = "What each part brings"
+    part = "ablation"
+
+    def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
+        """The errors along the path, if there is one."""
+        return {"chart": ablation_chart(summary) if summary.ablation.path else None}

@@ -1,0 +1,28 @@
+"""What decides the error: how much each hyperparameter does, and how."""
+
+from typing import Any
+
+from cconv.report.decidable import decidable
+from cconv.report.importance_plots import importance_chart, partial_dependence_chart
+from cconv.report.sections.section import Records, Section
+from cconv.report.tables import importance_table
+from cconv.study.records.summary import Summary
+
+
+class ImportanceSection(Section):
+    """Importance of the hyperparameters by rung, and the error against the strongest of them."""
+
+    name = "importance"
+    title = "What decides the error"
+    part = "importance"
+
+    def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
+        """What the trials can tell; and the charts, where they tell something."""
+        importance, dependences = summary.importance, summary.partial_dependence
+        is_known = any(entry.parameters for entry in importance)
+        return {
+            "decidable": decidable(importance),
+            "shares": importance_chart(importance) if is_known else None,
+            "rows": importance_table(importance).to_dict("records"),
+            "dependences": partial_dependence_chart(dependences) if dependences else None,
+        }

@@ -1,0 +1,33 @@
+"""What the recommended model and the baseline have learned: filters, a predicted frame, errors of particles."""
+
+from typing import Any
+
+from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
+from cconv.report.sections.section import Records, Section
+from cconv.study.records.summary import Summary
+
+
+class LearnedSection(Section):
+    """Filters beside those of analytic SPH, the predicted field beside the true one, and how errors are spread."""
+
+    name = "learned"
+    title = "What was learned"
+    part = "explained"
+
+    def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
+        """Charts of each explained model, the recommended one first."""
+        explanations = read_explanations(records.run, summary.explained)
+        best = summary.recommended.id
+        names = sorted(explanations, key=lambda name: name != best)
+        return {
+            "distribution": error_distribution_chart(explanations, summary.baseline, best),
+            "models": {
+                name: {
+                    "filters": filters_chart(explanations[name]),
+                    "fields": fields_chart(explanations[name], summary.task.symbol),
+                    "unexplained": float(explanations[name]["unexplained"]),
+                    "is_combined": bool(explanations[name]["is_combined"]),
+                }
+                for name in names
+            },
+        }
