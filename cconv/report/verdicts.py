@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-ALL = "every check"  # stands in the place of a check for the row that sums all up
+ALL = "all"  # stands in the place of a check for the row that sums all up
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def verdict_matrix(summary: Mapping) -> list[Row]:
     first = next((findings for findings in found if findings), None)
     if first is None:
         return []
-    rows = [Row(ALL, "passes", None, [_verdict(stability) for stability in measured])]
+    rows = [Row(ALL, "passes every check", None, [_verdict(stability) for stability in measured])]
     for key, finding in first.items():
         cells = [_cell(findings.get(key)) for findings in found]
         rows.append(Row(finding["check"], finding["label"].replace("_", " "), finding["limit"], cells))
