@@ -1,6 +1,5 @@
 """Generated data sets: same bytes for a seed, split, cut in time, resumed after a kill, never half-written."""
 
-import json
 import os
 import signal
 import subprocess
@@ -18,17 +17,11 @@ from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
 from cconv.data.simulate import simulate
 from cconv.errors import ConfigError, DataError, SimulationError
-from cconv.scenes import SCENES, scene_named
+from cconv.scenes import scene_named
 
 pytestmark = pytest.mark.integration
 
 FILES = ("train.h5", "valid.h5", "test.h5", "metadata.json")
-LAGRANGEBENCH_KEYS = {
-    "case", "solver", "density_evolution", "dim", "dx", "dt", "t_end", "viscosity", "p_bg_factor", "g_ext_magnitude",
-    "artificial_alpha", "free_slip", "write_every", "is_bc_trick", "sequence_length_train", "num_trajs_train",
-    "sequence_length_test", "num_trajs_test", "num_particles_max", "periodic_boundary_conditions", "bounds",
-    "default_connectivity_radius", "vel_mean", "vel_std", "acc_mean", "acc_std",
-}  # fmt: skip
 
 
 def tiny(name="taylor_green_2d", **settings):
@@ -39,27 +32,6 @@ def tiny(name="taylor_green_2d", **settings):
 def made(folder, scene=None, **settings):
     done = generate(scene or tiny(), folder, **{"num_trajectories": 4, "num_frames": 4, "workers": 1, **settings})
     return open_dataset(folder), done
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_every_scene_becomes_a_data_set(name, tmp_path):
-    scene = tiny(name)
-    count = 1 if scene.num_trajectories == 1 else 3
-    dataset, _ = made(tmp_path / "a", scene, num_trajectories=count, num_frames=4)
-    metadata = json.loads((tmp_path / "a" / "metadata.json").read_text())
-    assert set(metadata) == LAGRANGEBENCH_KEYS | {"cconv"}
-    assert metadata["cconv"]["features"] == scene.features
-    assert dataset.scene.name == name
-    assert dataset.scene.velocity_source == dataset.scene.mass_source == "stored"
-    assert dataset.scene.has_boundary == scene.features["walls"]
-    assert dataset.scene.frame_dt == pytest.approx(scene.frame_dt)
-    trajectory = dataset.trajectory("test", 0)
-    assert (trajectory.viscosities is not None) == scene.features["varying_viscosity"]
-    assert torch.isfinite(trajectory.velocities).all()
-    assert (dataset.scene.force is None) == (scene.gravity is None)
-    assert any(line.startswith("force:") for line in dataset.scene.missing) == (
-        scene.has_force and scene.gravity is None
-    )
 
 
 def test_same_seed_gives_the_same_bytes_whatever_the_workers_and_another_seed_others(tmp_path):
