@@ -22,12 +22,11 @@ def own_run(finished_run, tmp_path):
 
 
 def test_evaluate_gives_the_reported_test_error_again(cconv, finished_run):
-    summary = json.loads((finished_run / "summary.json").read_text())
-    for entry in summary["finalists"]:
-        checkpoint = finished_run / entry["checkpoint"]
+    for entry in RunFolder(finished_run).summary().finalists:
+        checkpoint = finished_run / entry.checkpoint
         status, out, _ = cconv("evaluate", checkpoint, "--json")
         assert status == 0
-        reported = entry["test"]["by_seed"][checkpoint.parent.name]
+        reported = entry.test.by_seed[checkpoint.parent.name]
         assert json.loads(out)["normalized_mse"] == pytest.approx(reported, rel=1e-6)
 
 
@@ -142,15 +141,13 @@ def test_damaged_records_are_named(cconv, finished_run, tmp_path):
     log = next((tmp_path / "run" / "trials").glob("*/log.jsonl"))
     log.write_text("{]}\n" + log.read_text())
     assert_one_clear_line(cconv("report", tmp_path / "run"), "log.jsonl", "delete that line")
-    summary = json.loads((finished_run / "summary.json").read_text())
-    checkpoint = tmp_path / "run" / summary["finalists"][0]["checkpoint"]
+    checkpoint = tmp_path / "run" / RunFolder(finished_run).summary().chosen.checkpoint
     (checkpoint / "card.json").write_text("{")
     assert_one_clear_line(cconv("evaluate", checkpoint), "card.json")
 
 
 def test_an_unknown_split_is_named(cconv, finished_run):
-    summary = json.loads((finished_run / "summary.json").read_text())
-    outcome = cconv("evaluate", finished_run / summary["finalists"][0]["checkpoint"], "--split", "tset")
+    outcome = cconv("evaluate", finished_run / RunFolder(finished_run).summary().chosen.checkpoint, "--split", "tset")
     assert_one_clear_line(outcome, "tset", "Did you mean 'test'")
 
 
@@ -162,8 +159,7 @@ def test_an_existing_run_is_not_touched(cconv, finished_run, flow_folder):
 
 
 def test_a_checkpoint_of_another_task_is_refused(cconv, finished_run):
-    summary = json.loads((finished_run / "summary.json").read_text())
-    checkpoint = finished_run / summary["finalists"][0]["checkpoint"]
+    checkpoint = finished_run / RunFolder(finished_run).summary().chosen.checkpoint
     outcome = cconv("evaluate", checkpoint, "--task", "density_rate")
     assert_one_clear_line(outcome, "density_gradient", "density_rate")
 

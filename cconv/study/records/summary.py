@@ -4,7 +4,7 @@ Errors are mean squares divided by the variance of the target over the training 
 are those of one frame. ``ci95`` is a 95 % interval, None where there is too little for one.
 """
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from cconv.study.records.forms import Count, NonNegative
 from cconv.study.records.found import Interval, Parts
@@ -403,6 +403,12 @@ class Selected(StrictModel):
 
 class Summary(Parts, Selected):
     """A finished study, in ``summary.json``: what the selection found, then what the stages before it found."""
+
+    @model_validator(mode="after")
+    def _a_finalist_is_recommended(self) -> "Summary":
+        if self.finalist(self.recommended.id) is None:
+            raise ValueError("`recommended.id` must be that of one of `finalists`")
+        return self
 
     def finalist(self, name: str) -> FinalistEntry | None:
         """The finalist of an id; None if it was not compared."""

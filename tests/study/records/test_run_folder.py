@@ -247,6 +247,10 @@ def negative_error(content):
     content["finalists"][1]["test"]["normalized_mse"] = -1.0
 
 
+def of_another(content):
+    content["recommended"]["id"] = "another"
+
+
 def misspelt(content):
     content["selection"]["tide"] = content["selection"].pop("tied")
 
@@ -256,6 +260,7 @@ def misspelt(content):
     [
         (without("study"), "`study` is missing"),
         (negative_error, r"`finalists\.1\.test\.normalized_mse`: .* greater than or equal to 0, got -1"),
+        (of_another, "`recommended.id` must be that of one of `finalists`"),
         (misspelt, r"unknown key `selection\.tide`\. Did you mean 'tied'"),
     ],
 )
