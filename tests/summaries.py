@@ -67,7 +67,7 @@ def minimal_summary(summary: Summary) -> Summary:
 def whole_summary(summary: Summary) -> Summary:
     """A summary with everything that a study may find, about the finalists of another."""
     ids = [entry.id for entry in summary.finalists]
-    finalists = [changed(entry, stability=stability(entry.test.normalized_mse)) for entry in summary.finalists]
+    finalists = [changed(entry, stability=stability(entry.test.error)) for entry in summary.finalists]
     return changed(
         minimal_summary(summary),
         checks={name: f"Errors of {name}." for name in ("regimes", "stress", "precision")},
@@ -109,9 +109,9 @@ def parts(baseline: str) -> dict:
 def finalist(name: str, *, updates: int = 81, fall_at_the_end: float | None = None, error: float = 0.01):
     """A finalist with one error everywhere."""
     errors = Errors(
-        normalized_mse=error,
-        relative_rmse=error**0.5,
-        per_frame_normalized_mse=error,
+        error=error,
+        in_words=f"about {error:.3g} of the spread",
+        measures={"relative RMSE": error**0.5},
         ci95=(error / 2, 2 * error),
         why_no_interval="",
         by_seed={"seed_1": error},
@@ -376,7 +376,7 @@ def _selection(ids: list[str]) -> Selection:
         tied=ids[:2],
         by_rule={"one_standard_error": ids[0], "accurate_enough": None},
         comparisons=[_comparison(name, number) for number, name in enumerate(ids)],
-        retrained=ExpectedError(normalized_mse=0.0321, choices={ids[0]: 4, ids[1]: 1}),
+        retrained=ExpectedError(error=0.0321, choices={ids[0]: 4, ids[1]: 1}),
     )
 
 

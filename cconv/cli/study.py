@@ -213,11 +213,11 @@ def _finalists_table(summary: "Summary") -> Table:
     table.add_column("model", overflow="fold")
     for name in ("error", "95 % interval", "ms per frame", "parameters", "stable"):
         table.add_column(name, justify="right", no_wrap=True)
-    for entry in sorted(summary.finalists, key=lambda entry: entry.test.normalized_mse):
+    for entry in sorted(summary.finalists, key=lambda entry: entry.test.error):
         mark = " *" if entry.id == summary.recommended.id else ""
         table.add_row(
             entry.id + mark,
-            f"{entry.test.normalized_mse:.4g}",
+            f"{entry.test.error:.4g}",
             "none" if entry.test.ci95 is None else "{:.3g}–{:.3g}".format(*entry.test.ci95),
             f"{entry.cost.ms_per_frame:.2f}",
             f"{entry.num_parameters:,}",

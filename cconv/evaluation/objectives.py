@@ -1,5 +1,6 @@
 """Objectives: what the models of a task are compared by, in the search, among finalists and in the test."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
-from cconv.models.errors import FrameError, frame_errors, mean_predictor_error, normalized_mse
+from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
 from cconv.tasks.task import FieldTask
@@ -21,12 +22,12 @@ class ErrorTable:
     Attributes:
         error: Error on the whole split.
         units: Error of each unit that an interval resamples, (units,): trajectories, or blocks of frames.
-        per_frame: The thesis's measure, each frame by its own variance; None where a task has none.
+        measures: Further measures by the names that the objective gives them; None where one is not defined.
     """
 
     error: float
     units: np.ndarray
-    per_frame: float | None
+    measures: dict[str, float | None]
 
 
 class Objective(ABC):
@@ -36,11 +37,13 @@ class Objective(ABC):
         name: Name by which tasks ask for it.
         label: What charts and messages call it.
         meaning: What it is, in sentences for readers.
+        measures: What else is measured beside it: the name of each measure, and what it is, in a sentence.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
     meaning: ClassVar[str]
+    measures: ClassVar[dict[str, str]] = {}
 
     @abstractmethod
     def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
@@ -63,6 +66,10 @@ class Objective(ABC):
         """
 
     @abstractmethod
+    def in_words(self, error: float) -> str:
+        """What an error means, as the end of a sentence."""
+
+    @abstractmethod
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
         """What a model must be below to know anything: the error of predicting the mean of the training split."""
 
@@ -74,9 +81,13 @@ class NormalizedMSE(Objective):
     label = "normalized MSE"
     meaning = (
         "Mean squared error divided by the variance of the target over the training split: 0 is perfect. Always "
-        "predicting the training mean scores 1 on the training split, more or less on others. Its root is the relative "
-        "RMSE."
+        "predicting the training mean scores 1 on the training split, more or less on others."
     )
+    measures = {
+        "relative RMSE": "The relative RMSE is the root of the normalized MSE.",
+        "per-frame MSE": "The per-frame MSE divides by each frame's own variance, as the thesis did, and serves only "
+        "to compare with it.",
+    }
 
     def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
         """Error over all particles of the samples; arguments as of `Objective.error`."""
@@ -84,11 +95,18 @@ class NormalizedMSE(Objective):
 
     def table(self, model: Model, samples: Sequence[Sample], frames_per_block: int) -> ErrorTable:
         """Errors over the split and its units; arguments as of `Objective.table`."""
-        frames: list[FrameError] = frame_errors(model, samples)
+        frames = frame_errors(model, samples)
+        error = normalized_mse(frames)
         return ErrorTable(
-            error=normalized_mse(frames),
+            error=error,
             units=blocks_of_errors(frames, frames_per_block),
-            per_frame=per_frame_normalized_mse(frames),
+            measures={"relative RMSE": math.sqrt(error), "per-frame MSE": per_frame_normalized_mse(frames)},
+        )
+
+    def in_words(self, error: float) -> str:
+        """The error of a typical particle as a share of the spread of the target."""
+        return (
+            f"a typical error of {100 * math.sqrt(error):.3g} % of the spread of the true values in the training data"
         )
 
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:

@@ -65,12 +65,11 @@ def finalists_table(summary: Summary) -> pd.DataFrame:
         rows.append(
             {
                 "model": entry.id,
-                "valid_error": entry.valid.normalized_mse,
-                "normalized_mse": entry.test.normalized_mse,
+                "valid_error": entry.valid.error,
+                "test_error": entry.test.error,
                 "ci95_low": low,
                 "ci95_high": high,
-                "relative_rmse": entry.test.relative_rmse,
-                "per_frame_normalized_mse": entry.test.per_frame_normalized_mse,
+                **entry.test.measures,
                 "ms_per_frame": entry.cost.ms_per_frame,
                 "ms_low": entry.cost.ms_low,
                 "ms_high": entry.cost.ms_high,
@@ -83,7 +82,7 @@ def finalists_table(summary: Summary) -> pd.DataFrame:
                 **entry.config.parameters,
             }
         )
-    return pd.DataFrame(rows).sort_values("normalized_mse", ignore_index=True)
+    return pd.DataFrame(rows).sort_values("test_error", ignore_index=True)
 
 
 def finalists_rows(summary: Summary) -> list[dict]:
@@ -170,10 +169,9 @@ def importance_table(importance: Sequence[RungImportance]) -> pd.DataFrame:
 
 def _reference_rows(summary: Summary) -> list[dict]:
     mean, analytic = summary.mean_predictor, summary.analytic
-    row = {"model": MEAN_PREDICTOR, "valid_error": mean.valid, "normalized_mse": mean.test}
-    rows = [row | {"relative_rmse": math.sqrt(mean.test)}]
+    rows: list[dict] = [{"model": MEAN_PREDICTOR, "valid_error": mean.valid, "test_error": mean.test}]
     if analytic:
-        exact = dict.fromkeys(("valid_error", "normalized_mse", "relative_rmse"), 0.0)
+        exact = dict.fromkeys(("valid_error", "test_error", *summary.task.measures), 0.0)
         times = {name: getattr(analytic, name) for name in ("ms_per_frame", "ms_low", "ms_high")}
         rows.append({"model": ANALYTIC} | exact | times)
     return rows
@@ -190,7 +188,7 @@ def _finalist_point(entry: FinalistEntry, summary: Summary, group: str) -> dict:
         "name": entry.id,
         "kind": "finalist",
         "group": group,
-        "error": entry.test.normalized_mse,
+        "error": entry.test.error,
         "error_low": low,
         "error_high": high,
         "ms": entry.cost.ms_per_frame,

@@ -45,6 +45,7 @@ def hostile(summary):
             entry,
             config=changed(entry.config, parameters=entry.config.parameters | hidden),
             stability=changed(entry.stability, failures=[HOSTILE], findings=findings),
+            test=changed(entry.test, in_words=HOSTILE, measures={HOSTILE: 1.0}),
         )
         for entry in summary.finalists
     ]
@@ -52,7 +53,7 @@ def hostile(summary):
     return changed(
         summary,
         checks=dict.fromkeys(summary.checks, HOSTILE),
-        task=changed(summary.task, **task),
+        task=changed(summary.task, **task, measures={HOSTILE: HOSTILE}),
         recommended=changed(summary.recommended, reason=f"{HOSTILE}. {HOSTILE}"),
         refined={HOSTILE: HOSTILE},
         failed_finalists={"lost": HOSTILE},

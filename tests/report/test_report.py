@@ -64,7 +64,7 @@ def test_a_report_shows_the_recommendation_and_every_finalist(run, no_charts):
     text, summary = render_report(run), run.summary()
     assert summary.recommended.reason.split(" (")[0] in text
     for entry in summary.finalists:
-        assert f"{entry.test.normalized_mse:.4g}" in text
+        assert f"{entry.test.error:.4g}" in text
 
 
 def test_a_report_has_a_section_for_everything_that_was_recorded(whole_report):
@@ -91,7 +91,7 @@ def words(text):
 def test_the_answer_says_what_it_was_chosen_by_and_what_is_reported(whole_run, whole_report):
     chosen, text = whole_run.summary().chosen, words(whole_report)
     assert "The choice was made by validation errors" in text
-    assert f"a normalized MSE of {chosen.test.normalized_mse:.3g} (95 % interval" in text
+    assert f"a normalized MSE of {chosen.test.error:.3g} (95 % interval" in text
     assert "has 1.58 on the test split" in text
     assert "has a test error of 0.0321" in text
     assert whole_report.count("<td>predicting the mean</td>") == 3  # finalists, comparisons, trials

@@ -49,11 +49,11 @@ def test_curves_table_has_a_row_an_evaluation(run):
 
 def test_finalists_table_is_sorted_by_error_between_exact_and_trivial(summary):
     table = finalists_table(summary)
-    assert table["normalized_mse"].is_monotonic_increasing
+    assert table["test_error"].is_monotonic_increasing
     assert set(table["model"]) == {entry.id for entry in summary.finalists} | {ANALYTIC, MEAN_PREDICTOR}
     trivial, exact = (table[table["model"] == name].iloc[0] for name in (MEAN_PREDICTOR, ANALYTIC))
-    assert (trivial["valid_error"], trivial["normalized_mse"]) == (4.5, 1.58)
-    assert (exact["normalized_mse"], exact["ms_per_frame"]) == (0, summary.analytic.ms_per_frame)
+    assert (trivial["valid_error"], trivial["test_error"]) == (4.5, 1.58)
+    assert (exact["test_error"], exact["ms_per_frame"]) == (0, summary.analytic.ms_per_frame)
 
 
 def test_intervals_hold_the_error_or_are_empty(summary):
@@ -61,7 +61,7 @@ def test_intervals_hold_the_error_or_are_empty(summary):
     test = changed(first.test, ci95=None, why_no_interval="2 units say too little")
     summary = changed(summary, finalists=[changed(first, test=test), *others])
     for table, value, low, high in (
-        (finalists_table(summary), "normalized_mse", "ci95_low", "ci95_high"),
+        (finalists_table(summary), "test_error", "ci95_low", "ci95_high"),
         (speed_accuracy_table(summary).query("kind == 'finalist'"), "error", "error_low", "error_high"),
     ):
         known = table[table[low].notna()]
@@ -112,7 +112,7 @@ def test_importances_have_a_row_a_rung_and_hyperparameter_where_they_are_known(s
 
 def test_verdicts_agree_with_the_limits(summary):
     rows = {(row.check, row.label): row for row in verdict_matrix(summary)}
-    errors = [entry.test.normalized_mse for entry in summary.finalists]
+    errors = [entry.test.error for entry in summary.finalists]
     assert [cell.passes for cell in rows["stress", "clumped"].cells] == [error <= 0.05 for error in errors]
     assert rows["regimes", "near wall"].limit == 0.5
     assert {cell.detail for cell in rows["regimes", "near wall"].cells} == {"10 % of particles"}

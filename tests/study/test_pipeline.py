@@ -1,6 +1,7 @@
 """One whole study of the smallest size, looked at from all sides."""
 
 import json
+import math
 
 import optuna
 import pytest
@@ -122,14 +123,15 @@ def test_the_summary_holds_what_every_stage_found_and_consistent_figures(summary
     for entry in summary.finalists:
         assert entry.test.ci95 is None  # of a single test trajectory
         assert entry.test.units.count == 1
-        assert entry.test.relative_rmse**2 == pytest.approx(entry.test.normalized_mse)
+        roots = [math.sqrt(error) for error in entry.test.by_seed.values()]
+        assert entry.test.measures["relative RMSE"] == pytest.approx(sum(roots) / len(roots))
 
 
 def test_what_was_chosen_was_chosen_by_validation_errors_and_each_split_has_its_mean_predictor(
     run, summary, flow_folder
 ):
     dataset, comparisons = open_dataset(flow_folder), summary.selection.comparisons
-    errors = {entry.id: entry.valid.normalized_mse for entry in summary.finalists}
+    errors = {entry.id: entry.valid.error for entry in summary.finalists}
     assert {each.id: each.error for each in comparisons} == pytest.approx(errors)
     assert summary.recommended.id in {each.id for each in comparisons if each.eligible}
     task = load_model(run.path / summary.finalists[0].checkpoint).task

@@ -32,7 +32,7 @@ def _lead(text: str) -> tuple[str, str]:
 
 def _ratios(baseline: FinalistEntry, chosen: FinalistEntry) -> dict[str, float]:
     return {
-        "error": baseline.test.normalized_mse / chosen.test.normalized_mse,
+        "error": baseline.test.error / chosen.test.error,
         "time": baseline.cost.ms_per_frame / chosen.cost.ms_per_frame,
         "size": baseline.num_parameters / chosen.num_parameters,
     }

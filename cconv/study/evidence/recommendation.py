@@ -195,7 +195,7 @@ def retrained_error(
         found.append((name, float(test[name][seed % len(test[name])].mean())))
     names = [name for name, _ in found]
     return ExpectedError(
-        normalized_mse=float(np.mean([error for _, error in found])),
+        error=float(np.mean([error for _, error in found])),
         choices={name: names.count(name) for name in dict.fromkeys(names)},
     )
 

@@ -1,7 +1,7 @@
 """What the stages of a study find, as typed values: each stage's part of ``stages/<name>.json`` and ``summary.json``.
 
-Errors are mean squares divided by the variance of the target over the training split. A field that ends in ``ci95`` is
-a 95 % interval, None where there is too little for one.
+Errors are those of the objective that the task names. A field that ends in ``ci95`` is a 95 % interval, None where
+there is too little for one.
 """
 
 from typing import Literal

@@ -1,7 +1,7 @@
 """The summary of a finished study, as typed values: what the selection found, and the parts of the other stages.
 
-Errors are mean squares divided by the variance of the target over the training split, unless said otherwise, and times
-are those of one frame. ``ci95`` is a 95 % interval, None where there is too little for one.
+Errors are those of the objective that the task names, and times are those of one frame. ``ci95`` is a 95 % interval,
+None where there is too little for one.
 """
 
 from pydantic import Field, model_validator
@@ -20,6 +20,7 @@ class TaskFacts(StrictModel):
         meaning: What networks predict, in words.
         error: What errors are called.
         error_meaning: What that is, in words.
+        measures: What else is measured, by name: what it is, in words.
     """
 
     name: Name
@@ -27,6 +28,7 @@ class TaskFacts(StrictModel):
     meaning: str
     error: str
     error_meaning: str
+    measures: dict[str, str]
 
 
 class DatasetFacts(StrictModel):
@@ -55,18 +57,18 @@ class Errors(StrictModel):
     """Errors of a finalist on a split, means over its seeds.
 
     Attributes:
-        normalized_mse: The error.
-        relative_rmse: Its root.
-        per_frame_normalized_mse: Error with each frame divided by its own variance; None where a frame has none.
+        error: The error.
+        in_words: What it means, as the end of a sentence.
+        measures: Further measures by name; None where one is not defined.
         ci95: Interval of the error over seeds and units.
         why_no_interval: The reason why there is none, or "".
         by_seed: Error of each training.
         units: Units of the split.
     """
 
-    normalized_mse: NonNegative
-    relative_rmse: NonNegative
-    per_frame_normalized_mse: NonNegative | None
+    error: NonNegative
+    in_words: str
+    measures: dict[str, NonNegative | None]
     ci95: Interval | None
     why_no_interval: str
     by_seed: dict[str, NonNegative]
@@ -285,7 +287,7 @@ class ComparedModel(StrictModel):
 class ExpectedError(StrictModel):
     """Test error to expect of a new training of what is chosen without one seed, and how often each model is chosen."""
 
-    normalized_mse: NonNegative
+    error: NonNegative
     choices: dict[Id, Count]
 
 

@@ -1,6 +1,5 @@
 """Finalists: the best configurations and the baseline retrained with fresh seeds, tested and timed."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,20 +181,25 @@ def evaluate_finalist(
         The mean errors, and the errors of each seed and unit (seeds, units).
     """
     tables = [objective.table(load_model(each), samples, frames_per_block) for each in finalist.checkpoints]
-    by_seed, per_frame = [table.error for table in tables], [table.per_frame for table in tables]
+    by_seed = [table.error for table in tables]
     units = np.stack([table.units for table in tables])
     mean = float(np.mean(by_seed))
     interval = crossed_interval(units)
     facts = Errors(
-        normalized_mse=mean,
-        relative_rmse=math.sqrt(mean),
-        per_frame_normalized_mse=None if None in per_frame else float(np.mean(per_frame)),
+        error=mean,
+        in_words=objective.in_words(mean),
+        measures={name: _mean_of_seeds([table.measures[name] for table in tables]) for name in objective.measures},
         ci95=None if interval is None else (min(interval[0], mean), max(interval[1], mean)),
         why_no_interval=why_no_interval(*units.shape),
         by_seed=dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         units=Units(count=units.shape[1], worst=float(units.mean(axis=0).max())),
     )
     return facts, units
+
+
+def _mean_of_seeds(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def finalist_entry(
@@ -221,10 +225,10 @@ def finalist_entry(
 def complete_cards(finalist: Retrained, test: Errors, environment: Mapping) -> None:
     """Add test errors and provenance to the card beside each of a finalist's models."""
     for record, folder in zip(finalist.records, finalist.checkpoints, strict=True):
-        own = {"normalized_mse": test.by_seed[record.id]}
+        own = {"error": test.by_seed[record.id]}
         card = read_card(folder) | {
             "finalist": finalist.id,
-            "test": own | {"mean_over_seeds": test.normalized_mse, "ci95": test.ci95},
+            "test": own | {"mean_over_seeds": test.error, "ci95": test.ci95},
             "data_sha256": environment["data"]["sha256"],
             "git_commit": environment["git_commit"],
         }

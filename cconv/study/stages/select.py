@@ -335,6 +335,7 @@ def _task(session: Session) -> TaskFacts:
         meaning=task.meaning,
         error=objective.label,
         error_meaning=objective.meaning,
+        measures=objective.measures,
     )
 
 

@@ -228,7 +228,7 @@ def test_what_is_chosen_by_validation_is_reported_without_bias():
         reported["by test"].append((test[by_test].mean(), networks[by_test]))
         reported["by validation"].append((test[by_validation].mean(), networks[by_validation]))
         reported["as if retrained"].append((test[by_validation].mean(), retrainings[by_validation]))
-        reported["retrained"].append((anew.normalized_mse, truth))
+        reported["retrained"].append((anew.error, truth))
     ratio = {name: np.divide(*np.mean(pairs, axis=0)) for name, pairs in reported.items()}
     chance = {name: bootstrap_error(np.array(pairs), rng) for name, pairs in reported.items()}
     assert ratio["by validation"] == pytest.approx(1, abs=3 * chance["by validation"])
@@ -251,7 +251,5 @@ def test_the_error_of_a_retraining_is_that_of_the_seed_that_did_not_choose():
     def choose(errors):
         return min(errors, key=lambda name: errors[name].mean())
 
-    assert retrained_error(valid, test, choose) == ExpectedError(
-        normalized_mse=(100 + 20 + 30) / 3, choices={"b": 1, "a": 2}
-    )
+    assert retrained_error(valid, test, choose) == ExpectedError(error=(100 + 20 + 30) / 3, choices={"b": 1, "a": 2})
     assert retrained_error({"a": np.ones((1, 4))}, {"a": np.ones((1, 4))}, choose) is None

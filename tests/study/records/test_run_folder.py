@@ -244,7 +244,7 @@ def without(key):
 
 
 def negative_error(content):
-    content["finalists"][1]["test"]["normalized_mse"] = -1.0
+    content["finalists"][1]["test"]["error"] = -1.0
 
 
 def of_another(content):
@@ -259,7 +259,7 @@ def misspelt(content):
     ("damage", "message"),
     [
         (without("study"), "`study` is missing"),
-        (negative_error, r"`finalists\.1\.test\.normalized_mse`: .* greater than or equal to 0, got -1"),
+        (negative_error, r"`finalists\.1\.test\.error`: .* greater than or equal to 0, got -1"),
         (of_another, "`recommended.id` must be that of one of `finalists`"),
         (misspelt, r"unknown key `selection\.tide`\. Did you mean 'tied'"),
     ],

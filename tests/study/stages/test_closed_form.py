@@ -145,7 +145,7 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
     assert record.is_closed_form
     model = load_model(run.path / entry.checkpoint)
     samples = list(iterate_samples(open_dataset(flow_folder), "test", model.task))
-    assert entry.test.normalized_mse == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
+    assert entry.test.error == pytest.approx(normalized_mse(frame_errors(model, samples)), rel=1e-6)
     assert list(entry.test.by_seed) == [record.id]
     assert "1 unit says too little of others" in entry.test.why_no_interval
     card = json.loads((run.path / entry.checkpoint / "card.json").read_text())
