@@ -1,5 +1,6 @@
 """D3 of the thesis: the gradient of density."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
@@ -16,7 +17,7 @@ class DensityGradient(FieldTask):
     symbol = "∇ρ"
     output = Kinds(0, 1)
 
-    def field(self, state: FluidState) -> Tensor:
+    def field(self, state: FluidState) -> Float[Tensor, "N D"]:
         """Gradients of density (N, D)."""
         return density_gradient(state.masses, state.densities, state.edges, state.kernel)
 
@@ -24,6 +25,6 @@ class DensityGradient(FieldTask):
         """Rest density a particle spacing."""
         return units.density / units.length
 
-    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Float[Tensor, "N D"]:
         """Gradients of density (N, D) by compiled sums; the densities are summed first, as a user has to."""
         return sums.density_gradient(state.masses, sums.density(state.masses, state.edges), state.edges)

@@ -1,5 +1,6 @@
 """D2 of the thesis: the material rate of density."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
@@ -16,7 +17,7 @@ class DensityRate(FieldTask):
     symbol = "Dρ/Dt"
     output = Kinds(1, 0)
 
-    def field(self, state: FluidState) -> Tensor:
+    def field(self, state: FluidState) -> Float[Tensor, "N 1"]:
         """Rates of density (N, 1)."""
         return density_rate(state.masses, state.velocities, state.edges, state.kernel)[:, None]
 
@@ -24,6 +25,6 @@ class DensityRate(FieldTask):
         """Rest density a frame's time."""
         return units.density / units.time
 
-    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Float[Tensor, " N"]:
         """Rates of density (N,) by compiled sums."""
         return sums.density_rate(state.masses, state.velocities, state.edges)
