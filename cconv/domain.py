@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.errors import ShapeError
@@ -58,7 +59,9 @@ class Box:
         """Edge lengths, D numbers."""
         return tuple(high - low for low, high in zip(self.lower, self.upper, strict=True))
 
-    def displacement(self, to: Tensor, origin: Tensor) -> Tensor:
+    def displacement(
+        self, to: Float[Tensor, "*#points D"], origin: Float[Tensor, "*#points D"]
+    ) -> Float[Tensor, "... D"]:
         """Minimum-image displacement ``to - origin``.
 
         Args:
@@ -75,7 +78,7 @@ class Box:
         periodic = torch.as_tensor(self.periodic, device=difference.device)
         return difference - torch.where(periodic, lengths * torch.round(difference / lengths), 0.0)
 
-    def wrap(self, positions: Tensor) -> Tensor:
+    def wrap(self, positions: Float[Tensor, "*points {self.dim}"]) -> Float[Tensor, "*points {self.dim}"]:
         """Positions (..., D) with every periodic axis brought back into [lower, upper)."""
         lower = torch.as_tensor(self.lower, dtype=positions.dtype, device=positions.device)
         lengths = torch.as_tensor(self.lengths, dtype=positions.dtype, device=positions.device)

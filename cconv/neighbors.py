@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from cconv.cell_list import CellGrid, Cells, half_pairs, pairs_by_receiver, separations
@@ -32,11 +33,11 @@ class Edges:
         includes_self: Whether each particle is listed as its own neighbour.
     """
 
-    receivers: Tensor
-    senders: Tensor
-    displacements: Tensor
-    distances: Tensor
-    row_splits: Tensor
+    receivers: Int[Tensor, " E"]
+    senders: Int[Tensor, " E"]
+    displacements: Float[Tensor, "E D"]
+    distances: Float[Tensor, " E"]
+    row_splits: Int[Tensor, " splits"]
     num_senders: int
     cutoff: float
     bipartite: bool
@@ -87,7 +88,11 @@ class Edges:
 
 
 def radius_graph(
-    positions: Tensor, cutoff: float, box: Box | None = None, queries: Tensor | None = None, include_self: bool = False
+    positions: Float[Tensor, "M D"],
+    cutoff: float,
+    box: Box | None = None,
+    queries: Float[Tensor, "N D"] | None = None,
+    include_self: bool = False,
 ) -> Edges:
     """All pairs within `cutoff`, found in a list of cells on the CPU.
 
@@ -132,7 +137,7 @@ def radius_graph(
     )
 
 
-def half_list(positions: Tensor, cutoff: float, box: Box | None = None) -> np.ndarray:
+def half_list(positions: Float[Tensor, "N D"], cutoff: float, box: Box | None = None) -> Int[np.ndarray, "P 2"]:
     """Pairs within `cutoff` without distances, each listed once: (P, 2), in no particular order.
 
     Arguments and errors are those of `radius_graph`.

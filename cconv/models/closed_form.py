@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
@@ -26,12 +27,12 @@ class NormalEquations:
         self._products = torch.zeros(num_terms, num_terms, dtype=torch.float64)
         self._projections = torch.zeros(num_terms, num_outputs, dtype=torch.float64)
 
-    def add(self, terms: Tensor, targets: Tensor) -> None:
+    def add(self, terms: Float[Tensor, "R P"], targets: Float[Tensor, "R C"]) -> None:
         """Take in terms (R, P) and targets (R, C)."""
         self._products.addmm_(terms.T, terms)
         self._projections.addmm_(terms.T, targets)
 
-    def solve(self, ridge: float) -> Tensor:
+    def solve(self, ridge: float) -> Float[Tensor, "P C"]:
         """Coefficients (P, C) that minimise the mean squared error + ``ridge`` · mean square of a term · |c|².
 
         Raises:

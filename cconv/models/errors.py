@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.models.model import Model
@@ -67,7 +68,7 @@ def mean_predictor_error(samples: Iterable[Sample], train_samples: Iterable[Samp
     return errors
 
 
-def _frame_error(sample: Sample, prediction: Tensor, target: Tensor) -> FrameError:
+def _frame_error(sample: Sample, prediction: Float[Tensor, "N C"], target: Float[Tensor, "N C"]) -> FrameError:
     """Error of a standardised prediction of a standardised target, both (N, C)."""
     squared = (prediction - target).double().square().mean().item()
     own_variance = target.double().var(dim=0, correction=0).mean().item()

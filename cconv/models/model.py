@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
@@ -108,10 +109,10 @@ class Model(nn.Module):
         generator: Source of the initial weights; None for torch's global one.
     """
 
-    feature_mean: Tensor
-    feature_scale: Tensor
-    target_mean: Tensor
-    target_scale: Tensor
+    feature_mean: Float[Tensor, " C_in"]
+    feature_scale: Float[Tensor, " C_in"]
+    target_mean: Float[Tensor, " C"]
+    target_scale: Float[Tensor, " C"]
 
     def __init__(
         self,
@@ -164,13 +165,13 @@ class Model(nn.Module):
         fluid, *walls = map(self.settings.geometry, results_of(searches))
         return FrameGeometry(fluid, walls[0] if walls else None)
 
-    def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Tensor:
+    def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "N C"]:
         """Standardised prediction (N, C)."""
         return self.network(*self.network_inputs(inputs, geometry))
 
     def network_inputs(
         self, inputs: Inputs, geometry: FrameGeometry
-    ) -> tuple[Tensor, Geometry, WallInputs[Geometry] | None]:
+    ) -> tuple[Float[Tensor, "N C_in"], Geometry, WallInputs[Geometry] | None]:
         """What the network takes: standardised features of the fluid, its geometry, and the same of the walls."""
         flat = inputs.features.select(self.config.fluid_features).flat()
         features = (flat - self.feature_mean) / self.feature_scale
@@ -179,17 +180,17 @@ class Model(nn.Module):
             return arranged, geometry.fluid, None
         return arranged, geometry.fluid, WallInputs(inputs.wall_features.flat(), geometry.walls)
 
-    def standardize_target(self, target: Tensor) -> Tensor:
+    def standardize_target(self, target: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """Target (N, C) in a sample's units to standardised values."""
         return (target - self.target_mean) / self.target_scale
 
     @torch.no_grad()
-    def predict(self, inputs: Inputs) -> Tensor:
+    def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_particles} C"]:
         """Prediction (N, C) in the units of the data that the inputs were made of."""
         field = self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
         return field * self.task.unit(inputs.units)
 
-    def predict_frame(self, frame: Frame, scene: Scene) -> Tensor:
+    def predict_frame(self, frame: Frame, scene: Scene) -> Float[Tensor, "N C"]:
         """Prediction (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
         return self.predict(self.inputs(frame, scene))
 

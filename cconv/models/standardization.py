@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
@@ -19,8 +20,8 @@ class Standardization:
         scale: (C,), positive.
     """
 
-    mean: Tensor
-    scale: Tensor
+    mean: Float[Tensor, " C"]
+    scale: Float[Tensor, " C"]
 
 
 def standardize_features(samples: Iterable[Features], center_vectors: bool = True) -> Standardization:
@@ -42,7 +43,7 @@ def standardize_features(samples: Iterable[Features], center_vectors: bool = Tru
     return Standardization(torch.cat([part.mean for part in parts]), torch.cat([part.scale for part in parts]))
 
 
-def standardize_values(frames: Iterable[Tensor], center: bool = True) -> Standardization:
+def standardize_values(frames: Iterable[Float[Tensor, "N C"]], center: bool = True) -> Standardization:
     """Standardisation of vectors (N, C): mean of each component, one scale for all.
 
     The scale is the root of the mean variance of the components, so that the mean squared error of standardised values

@@ -10,6 +10,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -27,12 +28,12 @@ from cconv.networks.counting import (
 from cconv.networks.network import (
     Channels,
     ConvolutionSettings,
+    Layers,
     LinearTerms,
     Network,
     WallInputs,
     assign_rows,
     check_single_layer,
-    module_list,
     with_inputs,
 )
 from cconv.nn.continuous_conv import MESSAGES, ContinuousConv, ConvGeometry
@@ -104,7 +105,7 @@ class ConvNet(Network[ConvGeometry]):
         of_added = bias and message == "absolute"
         self.boundary_conv = None if channels.walls is None else conv_of(channels.walls, first, bias=of_branch)
         widths = [(1 + (channels.walls is not None) + bool(self.own_channels)) * first, *rest]
-        self.convs = module_list(
+        self.convs = Layers(
             conv_of(inputs, outputs, bias=has_bias, message=message)
             for inputs, outputs, has_bias in [
                 (channels.inputs, first, of_branch),
@@ -112,7 +113,7 @@ class ConvNet(Network[ConvGeometry]):
             ]
         )
         of_first = [(self.own_channels, first)] if self.own_channels else []
-        self.dense = module_list(
+        self.dense = Layers(
             _linear(inputs, outputs, bias, initialization, generator)
             for inputs, outputs in [*of_first, *pairwise(widths)]
         )
@@ -122,15 +123,15 @@ class ConvNet(Network[ConvGeometry]):
         """Fully connected layer of layer 0, if there is one."""
         return self.dense[0] if self.own_channels else None
 
-    def own(self, features: Tensor) -> Tensor:
+    def own(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C_own"]:
         """What that layer takes of features (N, C_in)."""
         return features[:, features.shape[1] - self.own_channels :]
 
     def forward(
-        self, features: Tensor, geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
-    ) -> Tensor:
+        self, features: Float[Tensor, "N C_in"], geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
+    ) -> Float[Tensor, "N C_out"]:
         """Outputs (N, C_out) at the fluid particles, of features (N, C_in) and (B, C_wall); see `Network`."""
-        branches = [conv(*seen) for conv, seen in with_inputs(self.boundary_conv, walls)]
+        branches = [conv(seen.features, seen.geometry) for conv, seen in with_inputs(self.boundary_conv, walls)]
         branches.append(self.convs[0](features, geometry))
         if self.own_dense is not None:
             branches.append(self.own_dense(self.own(features)))
@@ -170,8 +171,8 @@ class GridTerms(LinearTerms[ConvGeometry]):
         self.network = network
 
     def terms(
-        self, features: Tensor, geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
-    ) -> list[Tensor]:
+        self, features: Float[Tensor, "N C"], geometry: ConvGeometry, walls: WallInputs[ConvGeometry] | None = None
+    ) -> list[Float[Tensor, "R P"]]:
         """Terms (N, P): columns of the boundary and the fluid, a particle's own features, one; those that there are."""
         own = MESSAGES[self.network.convs[0].message]
         parts = [] if walls is None else [columns(walls.features, walls.geometry.reads)]
@@ -180,12 +181,12 @@ class GridTerms(LinearTerms[ConvGeometry]):
             parts.append(torch.ones_like(features[:, :1]))
         return [torch.cat(parts, dim=1)]
 
-    def targets(self, target: Tensor) -> list[Tensor]:
+    def targets(self, target: Float[Tensor, "N C_out"]) -> list[Float[Tensor, "R C"]]:
         """Targets (N, C) of each set of terms."""
         return [target]
 
     @torch.no_grad()
-    def assign(self, coefficients: Sequence[Tensor]) -> None:
+    def assign(self, coefficients: Sequence[Float[Tensor, "P C"]]) -> None:
         """Make coefficients (P, C) those of the network."""
         (values,) = coefficients
         convs = [conv for conv in (self.network.boundary_conv, self.network.convs[0]) if conv is not None]
@@ -245,7 +246,7 @@ class ConvNetSettings(ConvolutionSettings):
             generator=generator,
         )
 
-    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
         """Features in the published order: the constant, unless differences are taken, vectors, further scalars."""
         scalars, vectors = split_kinds(features, kinds, dim)
         constant = [] if self.takes_differences else [scalars[:, :1]]

@@ -1,11 +1,12 @@
 """What every network has: settings that build it, its geometry, its counted cost, and, if linear, its terms."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Generic, Literal, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, Generic, Literal, TypeVar, overload
 
 import torch
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -62,7 +63,8 @@ class Channels(Generic[Width]):
         return self.inputs if self.own is None else self.own
 
 
-class WallInputs(NamedTuple, Generic[GeometryT]):
+@dataclass(frozen=True)
+class WallInputs(Generic[GeometryT]):
     """What a network sees of the walls.
 
     Attributes:
@@ -70,32 +72,48 @@ class WallInputs(NamedTuple, Generic[GeometryT]):
         geometry: Wall points seen from fluid particles.
     """
 
-    features: Tensor
+    features: Float[Tensor, "B C"]
     geometry: GeometryT
 
 
-def module_list(layers: Iterable[Layer]) -> Sequence[Layer]:
-    """Register layers in an `nn.ModuleList` and keep their type, which torch's list forgets."""
-    return cast(Sequence[Layer], nn.ModuleList(layers))
+class Layers(nn.ModuleList, Generic[Layer]):
+    """A list of layers of one type, which torch's list of modules would forget."""
+
+    def __init__(self, layers: Iterable[Layer]):
+        super().__init__(layers)
+
+    @overload
+    def __getitem__(self, index: slice) -> "Layers[Layer]": ...
+
+    @overload
+    def __getitem__(self, index: int) -> Layer: ...
+
+    def __getitem__(self, index: Any) -> Any:
+        return super().__getitem__(index)
+
+    def __iter__(self) -> Iterator[Layer]:
+        return (self[index] for index in range(len(self)))
 
 
 class LinearTerms(ABC, Generic[GeometryT]):
     """A network of a single layer as a linear map of its coefficients, for least squares."""
 
     @abstractmethod
-    def terms(self, features: Tensor, geometry: GeometryT, walls: WallInputs[GeometryT] | None = None) -> list[Tensor]:
+    def terms(
+        self, features: Float[Tensor, "N C"], geometry: GeometryT, walls: WallInputs[GeometryT] | None = None
+    ) -> list[Float[Tensor, "R P"]]:
         """Sets of terms (R, P): an output is terms @ coefficients. Arguments as of `Network.forward`."""
 
     @abstractmethod
-    def targets(self, target: Tensor) -> list[Tensor]:
+    def targets(self, target: Float[Tensor, "N C_out"]) -> list[Float[Tensor, "R C"]]:
         """Targets (R, C) of each set of terms, of a target (N, C) of the network."""
 
     @abstractmethod
-    def assign(self, coefficients: Sequence[Tensor]) -> None:
+    def assign(self, coefficients: Sequence[Float[Tensor, "P C"]]) -> None:
         """Make coefficients (P, C) of each set those of the network."""
 
 
-def assign_rows(weights: Sequence[Tensor], values: Tensor) -> None:
+def assign_rows(weights: Sequence[Tensor], values: Float[Tensor, "P C"]) -> None:
     """Copy rows of `values` (P, C) to weights whose last axis is C, in order."""
     rows = values.split([weight.numel() // values.shape[1] for weight in weights])
     for weight, part in zip(weights, rows, strict=True):
@@ -106,7 +124,9 @@ class Network(nn.Module, ABC, Generic[GeometryT]):
     """Maps features of fluid particles, and of walls, to outputs at the fluid particles."""
 
     @abstractmethod
-    def forward(self, features: Tensor, geometry: GeometryT, walls: WallInputs[GeometryT] | None = None) -> Tensor:
+    def forward(
+        self, features: Float[Tensor, "N C_in"], geometry: GeometryT, walls: WallInputs[GeometryT] | None = None
+    ) -> Float[Tensor, "N C_out"]:
         """Outputs at the fluid particles.
 
         Args:
@@ -185,7 +205,7 @@ class NetworkSettings(StrictModel, ABC):
         """
 
     @abstractmethod
-    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
         """Features (N, S + V · D), scalars first and a constant first of all, as the network takes them."""
 
     @abstractmethod

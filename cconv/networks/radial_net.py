@@ -5,6 +5,7 @@ from functools import partial
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -25,12 +26,12 @@ from cconv.networks.counting import (
 from cconv.networks.network import (
     Channels,
     ConvolutionSettings,
+    Layers,
     LinearTerms,
     Network,
     WallInputs,
     assign_rows,
     check_single_layer,
-    module_list,
     with_inputs,
 )
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
@@ -68,7 +69,7 @@ class VectorLinear(nn.Module):
             if weights.numel():
                 nn.init.xavier_uniform_(weights, generator=generator)
 
-    def forward(self, values: Tensor) -> Tensor:
+    def forward(self, values: Float[Tensor, "N C_in"]) -> Float[Tensor, "N C_out"]:
         """Values (N, S_in + V_in · D) to (N, S_out + V_out · D)."""
         scalars, vectors = split_kinds(values, self.in_channels, self.dim)
         mapped = torch.einsum("nvd,vw->nwd", vectors, self.vector_weights)
@@ -118,11 +119,11 @@ class RadialNet(Network[RadialGeometry]):
         outputs = [*(Kinds(scalars + vectors, vectors) for scalars, vectors in hidden), last]  # a gate for each vector
         conv_of = partial(RadialConv, num_terms=num_terms, dim=dim, bias=False, generator=generator)
         self.boundary_conv = None if channels.walls is None else conv_of(channels.walls, outputs[0])
-        self.convs = module_list(
+        self.convs = Layers(
             conv_of(before, after, message=message) for before, after in zip(inputs, outputs, strict=True)
         )
         mapped = zip([self.own_channels, *hidden], outputs, strict=True)
-        self.dense = module_list(
+        self.dense = Layers(
             VectorLinear(before, after, dim, bias, generator) for before, after in mapped if any(before)
         )
 
@@ -131,21 +132,24 @@ class RadialNet(Network[RadialGeometry]):
         """Linear map of the first layer, if there is one."""
         return self.dense[0] if any(self.own_channels) else None
 
-    def own(self, features: Tensor) -> Tensor:
+    def own(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C_own"]:
         """What that map takes of features (N, S + V · D)."""
         own = self.own_channels
         scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
         return join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
 
     def forward(
-        self, features: Tensor, geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
-    ) -> Tensor:
+        self,
+        features: Float[Tensor, "N C_in"],
+        geometry: RadialGeometry,
+        walls: WallInputs[RadialGeometry] | None = None,
+    ) -> Float[Tensor, "N C_out"]:
         """Scalars and vectors of the last layer, (N, S + V · D), of such values of its inputs; see `Network`."""
         output = self.convs[0](features, geometry)
         if self.own_dense is not None:
             output = output + self.own_dense(self.own(features))
         for conv, seen in with_inputs(self.boundary_conv, walls):
-            output = output + conv(*seen)
+            output = output + conv(seen.features, seen.geometry)
         following_dense = self.dense[any(self.own_channels) :]
         for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
@@ -171,10 +175,11 @@ class RadialTerms(LinearTerms[RadialGeometry]):
         self.network = network
 
     def terms(
-        self, features: Tensor, geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
-    ) -> list[Tensor]:
+        self, features: Float[Tensor, "N C"], geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
+    ) -> list[Float[Tensor, "R P"]]:
         """Terms of the scalars (N, P) and of the components of the vectors (N · D, P'), where there are any."""
-        gathered = [_radial_columns(conv, *seen) for conv, seen in with_inputs(self.network.boundary_conv, walls)]
+        branches = with_inputs(self.network.boundary_conv, walls)
+        gathered = [_radial_columns(conv, seen.features, seen.geometry) for conv, seen in branches]
         gathered.append(_radial_columns(self.network.convs[0], features, geometry))
         scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
         of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
@@ -184,14 +189,14 @@ class RadialTerms(LinearTerms[RadialGeometry]):
         terms = [torch.cat(of_scalars, dim=1), torch.cat(of_vectors, dim=1)]
         return [values for values, count in zip(terms, self._out_channels, strict=True) if count]
 
-    def targets(self, target: Tensor) -> list[Tensor]:
+    def targets(self, target: Float[Tensor, "N C_out"]) -> list[Float[Tensor, "R C"]]:
         """Targets (N, S) and (N · D, V) of each set of terms."""
         scalars, vectors = split_kinds(target, self._out_channels, self.network.dim)
         targets = [scalars, vectors.transpose(1, 2).flatten(0, 1)]
         return [values for values, count in zip(targets, self._out_channels, strict=True) if count]
 
     @torch.no_grad()
-    def assign(self, coefficients: Sequence[Tensor]) -> None:
+    def assign(self, coefficients: Sequence[Float[Tensor, "P C"]]) -> None:
         """Make coefficients (P, S) and (P', V) those of the network."""
         network, dense = self.network, self.network.own_dense
         convs = [conv for conv in (network.boundary_conv, network.convs[0]) if conv is not None]
@@ -242,7 +247,7 @@ class RadialNetSettings(ConvolutionSettings):
             generator=generator,
         )
 
-    def arrange(self, features: Tensor, kinds: Kinds, dim: int) -> Tensor:
+    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
         """Scalars, without the constant where differences are taken, then vectors."""
         return features[:, 1:] if self.takes_differences else features
 

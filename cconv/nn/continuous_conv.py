@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
@@ -146,7 +147,7 @@ def grid_shape(kernel_size: int | tuple[int, ...], dim: int) -> tuple[int, ...]:
     return shape
 
 
-def importance(edges: Edges, window: str, normalize: bool) -> Tensor:
+def importance(edges: Edges, window: str, normalize: bool) -> Float[Tensor, " E"]:
     """Window a_R of each edge (E,), divided by ψ of its receiver if `normalize`."""
     values = window_values((edges.distances / edges.cutoff) ** 2, window)
     if not normalize:
@@ -156,8 +157,12 @@ def importance(edges: Edges, window: str, normalize: bool) -> Tensor:
 
 
 def continuous_conv(
-    features: Tensor, filters: Tensor, geometry: ConvGeometry, bias: Tensor | None = None, message: str = "absolute"
-) -> Tensor:
+    features: Float[Tensor, "M C_in"],
+    filters: Float[Tensor, "*cells C_in C_out"],
+    geometry: ConvGeometry,
+    bias: Float[Tensor, " C_out"] | None = None,
+    message: str = "absolute",
+) -> Float[Tensor, "N C_out"]:
     """Continuous convolution of `features` with `filters`; equation in the module's docstring.
 
     On the CPU in float32 or float64, compiled loops over blocks of particles keep memory independent of their number
@@ -303,13 +308,13 @@ class ContinuousConv(nn.Module):
             self.center_weights = nn.Parameter(torch.empty(in_channels, out_channels))
             nn.init.xavier_uniform_(self.center_weights, generator=generator)
 
-    def forward(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
+    def forward(self, features: Float[Tensor, "M C_in"], geometry: ConvGeometry) -> Float[Tensor, "N C_out"]:
         """Features (M, C_in) of the senders to (N, C_out) at the receivers; errors as of `continuous_conv`."""
         _check_inputs(features, self.filters, geometry, self.bias, self.message)
         check_finite("features", features)
         return self.convolve(features, geometry)
 
-    def convolve(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
+    def convolve(self, features: Float[Tensor, "M C_in"], geometry: ConvGeometry) -> Float[Tensor, "N C_out"]:
         """`forward` without its checks, for hidden layers: what diverged weights make of good inputs passes on."""
         if self.center != "none" and (geometry.bipartite or geometry.includes_self):
             raise ConfigError(
@@ -326,7 +331,7 @@ class ContinuousConv(nn.Module):
         return self.filters[tuple(size // 2 for size in self.filters.shape[:-2])]
 
 
-def antisymmetric_filters(filters: Tensor) -> Tensor:
+def antisymmetric_filters(filters: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The part of a filter grid that changes sign at the origin, K(-r) = -K(r); shape (*kernel_size, C_in, C_out)."""
     return 0.5 * (filters - filters.flip(tuple(range(filters.ndim - 2))))
 
@@ -360,7 +365,7 @@ class AntisymmetricConv(nn.Module):
         super().__init__()
         self.filters = uniform_filters(grid_shape(kernel_size, dim), in_channels, out_channels, generator)
 
-    def forward(self, features: Tensor, geometry: ConvGeometry) -> Tensor:
+    def forward(self, features: Float[Tensor, "N C_in"], geometry: ConvGeometry) -> Float[Tensor, "N C_out"]:
         """Features (N, C_in) to (N, C_out), summing to zero over the particles.
 
         Raises:

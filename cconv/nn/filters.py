@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from cconv.errors import check_choice
@@ -68,7 +69,7 @@ MAPPINGS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def map_ball_to_cube(ball: Tensor, mapping: str) -> Tensor:
+def map_ball_to_cube(ball: Float[Tensor, "E D"], mapping: str) -> Float[Tensor, "E D"]:
     """Coordinate map Λ from the unit ball to the cube [-1/2, 1/2]^D.
 
     Args:
@@ -98,7 +99,7 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def window_values(squared: Tensor, window: str) -> Tensor:
+def window_values(squared: Float[Tensor, "*shape"], window: str) -> Float[Tensor, "*shape"]:
     """Window a_R of the squared relative distance (r/R)², for r up to R.
 
     Args:
@@ -115,7 +116,7 @@ def window_values(squared: Tensor, window: str) -> Tensor:
     return WINDOWS[window](squared)
 
 
-def grid_coordinates(cube: Tensor, sizes: tuple[int, ...], align_corners: bool) -> Tensor:
+def grid_coordinates(cube: Float[Tensor, "E D"], sizes: tuple[int, ...], align_corners: bool) -> Float[Tensor, "E D"]:
     """Coordinates g on the filter grid, cell centres at the whole numbers 0 ... F-1.
 
     Args:
@@ -155,7 +156,9 @@ INTERPOLATIONS: dict[str, Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tenso
 }
 
 
-def interpolate(grid: Tensor, sizes: tuple[int, ...], interpolation: str) -> tuple[Tensor, Tensor, Tensor]:
+def interpolate(
+    grid: Float[Tensor, "E D"], sizes: tuple[int, ...], interpolation: str
+) -> tuple[Int32[Tensor, "E D"], Float[Tensor, "E A"], Float[Tensor, " E"]]:
     """Cells that a grid coordinate reads.
 
     Args:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -17,12 +18,14 @@ class Kinds(NamedTuple):
         return self.scalars + self.vectors * dim
 
 
-def split_kinds(values: Tensor, kinds: Kinds, dim: int) -> tuple[Tensor, Tensor]:
+def split_kinds(
+    values: Float[Tensor, "N C"], kinds: Kinds, dim: int
+) -> tuple[Float[Tensor, "N {kinds.scalars}"], Float[Tensor, "N {kinds.vectors} {dim}"]]:
     """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
     scalars, vectors = values.split([kinds.scalars, kinds.vectors * dim], dim=1)
     return scalars, vectors.reshape(len(values), kinds.vectors, dim)
 
 
-def join_kinds(scalars: Tensor, vectors: Tensor) -> Tensor:
+def join_kinds(scalars: Float[Tensor, "N S"], vectors: Float[Tensor, "N V D"]) -> Float[Tensor, "N S+V*D"]:
     """Values (N, S + V · D) of scalars (N, S) and vectors (N, V, D)."""
     return torch.cat([scalars, vectors.flatten(1)], dim=1)

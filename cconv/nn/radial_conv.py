@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from functools import cached_property
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
@@ -95,14 +96,14 @@ class RadialGeometry:
         return self.reads.nbytes + sum(tensor.nbytes for tensor in held)
 
     @cached_property
-    def directions(self) -> Tensor:
+    def directions(self) -> Float[Tensor, "E {self.dim}"]:
         """(x_j - x_i) / r, (E, D); 0 where two points coincide."""
         with self._gradients():
             apart = torch.where(self.edges.distances > 0, self.edges.distances, 1.0)
             return -self.edges.displacements / apart[:, None]
 
     @cached_property
-    def weights(self) -> Tensor | None:
+    def weights(self) -> Float[Tensor, " E"] | None:
         """Window of each edge (E,), divided by ψ if normalised; None where all weigh 1."""
         if self._window == "none" and not self._normalize:
             return None
@@ -134,7 +135,9 @@ class RadialGeometry:
         with torch.inference_mode(False), torch.set_grad_enabled(self._differentiates):
             yield
 
-    def messages(self, features: Tensor, channels: Kinds, message: str) -> tuple[Tensor, Tensor]:
+    def messages(
+        self, features: Float[Tensor, "M C"], channels: Kinds, message: str
+    ) -> tuple[Float[Tensor, "E to_scalars"], Float[Tensor, "{self.dim} E to_vectors"]]:
         """What each edge contributes before the radial terms.
 
         Returns:
@@ -187,7 +190,7 @@ class RadialConv(nn.Module):
         self.vector_filters = uniform_filters((num_terms,), scalars + 2 * vectors, out_channels.vectors, generator)
         self.bias = nn.Parameter(torch.zeros(out_channels.scalars)) if bias else None
 
-    def forward(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
+    def forward(self, features: Float[Tensor, "M C_in"], geometry: RadialGeometry) -> Float[Tensor, "N C_out"]:
         """Values (M, S_in + V_in · D) of the senders to (N, S_out + V_out · D) at the receivers.
 
         Raises:
@@ -198,7 +201,7 @@ class RadialConv(nn.Module):
         check_finite("features", features)
         return self.convolve(features, geometry)
 
-    def convolve(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
+    def convolve(self, features: Float[Tensor, "M C_in"], geometry: RadialGeometry) -> Float[Tensor, "N C_out"]:
         """`forward` without its checks, for hidden layers."""
         filters = self.scalar_filters, self.vector_filters
         if radial.applies(features, *filters, geometry.edges):

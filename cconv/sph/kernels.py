@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.errors import ConfigError, check_choice
@@ -42,13 +43,13 @@ class AbstractKernel(ABC):
         """Distance κh from which on W is 0."""
         return self.relative_support * self.smoothing_length
 
-    def value(self, r: Tensor) -> Tensor:
+    def value(self, r: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """W(r), 1/length^D, for distances r of any shape."""
         q = r / self.smoothing_length
         scale = self._sigma() / self.smoothing_length**self.dim
         return torch.where(r < self.support_radius, scale * self._profile(q), 0.0)
 
-    def derivative(self, r: Tensor) -> Tensor:
+    def derivative(self, r: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """dW/dr, 1/length^(D+1), for distances r of any shape."""
         q = r / self.smoothing_length
         scale = self._sigma() / self.smoothing_length ** (self.dim + 1)

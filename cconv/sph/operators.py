@@ -5,6 +5,7 @@ Numbers are those of the thesis, section 2.2.1; i is ``edges.receivers``, j is `
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.errors import ConfigError, check_shape
@@ -12,7 +13,7 @@ from cconv.neighbors import Edges
 from cconv.sph.kernels import AbstractKernel
 
 
-def density(masses: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+def density(masses: Float[Tensor, " M"], edges: Edges, kernel: AbstractKernel) -> Float[Tensor, " N"]:
     r"""Density by summation (D1), the particle itself included.
 
     .. math:: \rho_i = \sum_j m_j W(|r_{ij}|, h)
@@ -38,7 +39,9 @@ def density(masses: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
     return rho + masses * kernel.value(masses.new_zeros(()))
 
 
-def density_rate(masses: Tensor, velocities: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+def density_rate(
+    masses: Float[Tensor, " N"], velocities: Float[Tensor, "N D"], edges: Edges, kernel: AbstractKernel
+) -> Float[Tensor, " N"]:
     r"""Material rate of density (D2), exactly d/dt of D1 along the particles' motion.
 
     .. math:: \frac{D\rho_i}{Dt} = \sum_j m_j (v_i - v_j) \cdot \nabla_i W_{ij}
@@ -64,7 +67,9 @@ def density_rate(masses: Tensor, velocities: Tensor, edges: Edges, kernel: Abstr
     return _sum_over_neighbours(terms, edges)
 
 
-def density_gradient(masses: Tensor, densities: Tensor, edges: Edges, kernel: AbstractKernel) -> Tensor:
+def density_gradient(
+    masses: Float[Tensor, " N"], densities: Float[Tensor, " N"], edges: Edges, kernel: AbstractKernel
+) -> Float[Tensor, "N D"]:
     r"""Gradient of density (D3), with the sign that converges to ∇ρ.
 
     .. math:: \nabla \rho_i = \frac{1}{\rho_i} \sum_j m_j (\rho_j - \rho_i) \nabla_i W_{ij}
@@ -93,7 +98,7 @@ def density_gradient(masses: Tensor, densities: Tensor, edges: Edges, kernel: Ab
     return _sum_over_neighbours(terms, edges) / densities[:, None]
 
 
-def kernel_gradient(edges: Edges, kernel: AbstractKernel) -> Tensor:
+def kernel_gradient(edges: Edges, kernel: AbstractKernel) -> Float[Tensor, "E D"]:
     """∇_i W_ij of every edge (E, D); zero where two particles coincide."""
     apart = edges.distances > 0
     direction = edges.displacements / torch.where(apart, edges.distances, 1.0)[:, None]

@@ -1,5 +1,6 @@
 """D3 of the thesis: the gradient of density."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
@@ -21,7 +22,7 @@ class DensityGradient(FieldTask):
     output = Kinds(0, 1)
     checks = ("regimes", "stress", "precision")
 
-    def field(self, state: FluidState) -> Tensor:
+    def field(self, state: FluidState) -> Float[Tensor, "N D"]:
         """Gradients of density (N, D)."""
         return density_gradient(state.masses, state.densities, state.edges, state.kernel)
 
@@ -33,6 +34,6 @@ class DensityGradient(FieldTask):
         """The density by the length, at any speed."""
         return density / length
 
-    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Float[Tensor, "N D"]:
         """Gradients of density (N, D) by compiled sums; the densities are summed first, as a user has to."""
         return sums.density_gradient(state.masses, sums.density(state.masses, state.edges), state.edges)

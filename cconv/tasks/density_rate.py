@@ -1,5 +1,6 @@
 """D2 of the thesis: the material rate of density."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
@@ -21,7 +22,7 @@ class DensityRate(FieldTask):
     output = Kinds(1, 0)
     checks = ("regimes", "stress", "still", "precision", "density")
 
-    def field(self, state: FluidState) -> Tensor:
+    def field(self, state: FluidState) -> Float[Tensor, "N 1"]:
         """Rates of density (N, 1)."""
         return density_rate(state.masses, state.velocities, state.edges, state.kernel)[:, None]
 
@@ -33,6 +34,6 @@ class DensityRate(FieldTask):
         """The density in the time that the flow takes for the length."""
         return density * speed / length
 
-    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Float[Tensor, " N"]:
         """Rates of density (N,) by compiled sums."""
         return sums.density_rate(state.masses, state.velocities, state.edges)

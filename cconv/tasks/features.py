@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
@@ -43,7 +44,7 @@ class Units:
         return self.length / self.time
 
 
-def units_of(masses: Tensor, scene: Scene) -> Units:
+def units_of(masses: Float[Tensor, " N"], scene: Scene) -> Units:
     """Units of a frame whose fluid particles have masses (N,)."""
     mean_mass = float(masses.double().mean()) if len(masses) else 1.0
     return Units(
@@ -62,8 +63,8 @@ class Features:
         vector_names: Names of the vectors, V.
     """
 
-    scalars: Tensor
-    vectors: Tensor
+    scalars: Float[Tensor, "N S"]
+    vectors: Float[Tensor, "N V D"]
     scalar_names: tuple[str, ...]
     vector_names: tuple[str, ...]
 
@@ -77,7 +78,7 @@ class Features:
         """Numbers of scalars and vectors."""
         return Kinds(len(self.scalar_names), len(self.vector_names))
 
-    def flat(self) -> Tensor:
+    def flat(self) -> Float[Tensor, "N C"]:
         """Scalars and the components of the vectors, (N, S + V · D)."""
         return join_kinds(self.scalars, self.vectors)
 
@@ -126,9 +127,9 @@ class Inputs:
         units: What these numbers are multiples of.
     """
 
-    positions: Tensor
+    positions: Float[Tensor, "N D"]
     features: Features
-    wall_positions: Tensor | None
+    wall_positions: Float[Tensor, "B D"] | None
     wall_features: Features | None
     box: Box
     units: Units
@@ -171,9 +172,9 @@ class FluidState:
         kernel: SPH kernel of densities and fields.
     """
 
-    positions: Tensor
-    velocities: Tensor
-    masses: Tensor
+    positions: Float[Tensor, "N D"]
+    velocities: Float[Tensor, "N D"]
+    masses: Float[Tensor, " N"]
     box: Box | None
     kernel: AbstractKernel
 
@@ -183,11 +184,11 @@ class FluidState:
         return radius_graph(self.positions, self.kernel.support_radius, self.box)
 
     @cached_property
-    def densities(self) -> Tensor:
+    def densities(self) -> Float[Tensor, " N"]:
         """Density by summation over fluid particles only (D1), as in the thesis, (N,)."""
         return density(self.masses, self.edges, self.kernel)
 
-    def knowing(self, edges: Edges, densities: Tensor) -> "FluidState":
+    def knowing(self, edges: Edges, densities: Float[Tensor, " N"]) -> "FluidState":
         """The same particles with neighbours and densities (N,) that come from elsewhere."""
         state = replace(self)
         vars(state).update(edges=edges, densities=densities)

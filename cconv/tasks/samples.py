@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
@@ -27,7 +28,7 @@ class Sample:
     trajectory: str
     frame: int
     inputs: Inputs
-    target: Tensor
+    target: Float[Tensor, "N C"]
     target_unit: float
 
 

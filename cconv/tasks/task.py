@@ -5,6 +5,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar
 
+from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
@@ -37,7 +38,7 @@ class FieldTask(ABC):
     relative_smoothing_length: float = 1.0
 
     @abstractmethod
-    def field(self, state: FluidState) -> Tensor:
+    def field(self, state: FluidState) -> Float[Tensor, "N C"]:
         """Analytic field (N, C) at the fluid particles, in the units of the data."""
 
     @abstractmethod

@@ -32,7 +32,9 @@ def test_layers_follow_figure_3_1(scene, generator):
     """The forward pass spelled out: concatenate, then convolution + dense, skip before the activation."""
     features, geometry, walls = scene
     net = ConvNet(FULL, CELLS, generator=generator)
-    z = torch.cat([net.boundary_conv(*walls), net.convs[0](features, geometry), net.dense[0](features)], 1)
+    z = torch.cat(
+        [net.boundary_conv(walls.features, walls.geometry), net.convs[0](features, geometry), net.dense[0](features)], 1
+    )
     z = net.convs[1](z.relu(), geometry) + net.dense[1](z.relu())
     z = net.convs[2](z.relu(), geometry) + net.dense[2](z.relu()) + z
     z = net.convs[3](z.relu(), geometry) + net.dense[3](z.relu())
@@ -42,7 +44,9 @@ def test_layers_follow_figure_3_1(scene, generator):
 def test_a_single_layer_adds_its_branches(scene, generator):
     features, geometry, walls = scene
     net = ConvNet(Channels(4, (2,), walls=3), CELLS, generator=generator)
-    expected = net.boundary_conv(*walls) + net.convs[0](features, geometry) + net.dense[0](features)
+    expected = (
+        net.boundary_conv(walls.features, walls.geometry) + net.convs[0](features, geometry) + net.dense[0](features)
+    )
     torch.testing.assert_close(net(*scene), expected)
 
 

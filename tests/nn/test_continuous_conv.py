@@ -1,6 +1,7 @@
 import itertools
 from dataclasses import replace
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -221,7 +222,8 @@ def test_stated_memory_is_what_is_held(cloud):
 
 
 @pytest.mark.slow
-def test_a_compiled_graph_gives_the_same(cloud, generator):
+def test_a_compiled_graph_gives_the_same(cloud, generator, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the checks, not the annotations, break the graph
     features, filters = normal(generator, 30, 3), normal(generator, 4, 4, 4, 3, 5)
     geometry = ConvGeometry(radius_graph(cloud, 0.4), 4)
     compiled = torch.compile(continuous_conv, fullgraph=True, backend="aot_eager")
