@@ -8,7 +8,7 @@ radial terms count exactly as they do in a prediction.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -17,8 +17,10 @@ import torch
 from torch import Tensor
 
 from cconv.domain import Box
+from cconv.errors import ConfigError
 from cconv.models.model import Model
 from cconv.neighbors import radius_graph
+from cconv.networks.network import ConvolutionNetwork, ConvolutionSettings
 from cconv.nn.filters import window_values
 from cconv.nn.kinds import split_kinds
 from cconv.sph.operators import density
@@ -39,8 +41,10 @@ def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
 
     Returns:
         "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
-        "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns.
+        "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns,
+        where the network is one of convolutions.
     """
+    is_convolutional = isinstance(model.network, ConvolutionNetwork)
     spacing = sample.inputs.units.length
     return {
         "particle_spacing": np.array(spacing),
@@ -48,7 +52,7 @@ def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
         "target": (sample.target * sample.target_unit).numpy(),
         "prediction": model.predict(sample.inputs).numpy(),
         "error": _relative_errors(model, sample).square().numpy(),
-        **first_layer_filters(model, sample),
+        **(first_layer_filters(model, sample) if is_convolutional else {}),
     }
 
 
@@ -77,7 +81,7 @@ def error_distribution(model: Model, samples: Iterable[Sample]) -> dict[str, np.
 
 @torch.no_grad()
 def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
-    """Learned filters of the fluid's first layer beside the analytic ones.
+    """Learned filters of the fluid's first layer beside the analytic ones, of a network of convolutions.
 
     A network of one layer is compared as it is. The outputs of a deeper one have no meaning of their own: its filters
     are combined linearly so that they come as near to the analytic ones as they can, by least squares over the ball.
@@ -97,11 +101,11 @@ def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
     unexplained = _unexplained(learned[pairs.ball], analytic[pairs.ball], pairs.volume)
     per_feature = _filter_units(sample)
     learned, analytic = learned * per_feature, analytic * per_feature
-    reads_density = bool(model.config.output.vectors)
-    profile = _along_direction(learned, pairs, sample.inputs.features, reads_density)
+    read = _read_names(analytic, sample.inputs.features)
+    profile = _along_direction(learned, pairs, sample.inputs.features, read)
     length = sample.inputs.units.length
     results = {
-        "is_combined": torch.tensor(len(model.network.convs) > 1),
+        "is_combined": torch.tensor(_has_several_layers(model)),
         "unexplained": unexplained,
         "cutoff": torch.tensor(length * model.settings.relative_cutoff),
         "support": torch.tensor(length * model.kernel_at(1.0).support_radius),
@@ -112,7 +116,7 @@ def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
         "learned_radial": profile.mean(dim=1),
         "learned_radial_low": profile.quantile(0.05, dim=1),
         "learned_radial_high": profile.quantile(0.95, dim=1),
-        "analytic_radial": _along_direction(analytic, pairs, sample.inputs.features, reads_density)[:, 0],
+        "analytic_radial": _along_direction(analytic, pairs, sample.inputs.features, read)[:, 0],
     }
     return {"feature_names": np.array(_component_names(sample.inputs.features))} | {
         name: values.numpy() for name, values in results.items()
@@ -181,17 +185,18 @@ def _directions(dim: int) -> Tensor:
 def _learned_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
     """Answers of the first convolution (P, F, C_out), by unit of each feature, without bias."""
     twin, given = deepcopy(model).double(), sample.inputs
-    twin.settings = model.settings.model_copy(update={"normalize": False})
+    (network, _), (_, settings) = _convolutions(twin), _convolutions(model)
+    twin.settings = settings.model_copy(update={"normalize": False})
     rest = given.features.flat().double().mean(dim=0).expand(2 * len(pairs.displacements), -1)
     isolated = _isolated_inputs(pairs, rest, given)
     geometry = twin.geometry(isolated)
 
     def answer(features: Tensor) -> Tensor:
         values = twin.network_inputs(_isolated_inputs(pairs, features, given), geometry)[0]
-        return twin.network.convs[0](values, geometry.fluid)[: len(pairs.displacements)]
+        return network.convs[0](values, geometry.fluid)[: len(pairs.displacements)]
 
     answers = [answer(raised) - answer(rest) for raised in _raised(rest)]
-    return torch.stack(answers, dim=1) / (_mean_window_sum(model, sample) if model.settings.normalize else 1)
+    return torch.stack(answers, dim=1) / (_mean_window_sum(settings, sample) if settings.normalize else 1)
 
 
 def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
@@ -271,17 +276,28 @@ def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
     )
 
 
-def _mean_window_sum(model: Model, sample: Sample) -> Tensor:
+def _convolutions(model: Model) -> tuple[ConvolutionNetwork, ConvolutionSettings]:
+    """The network and its settings, of a model whose filters are probed."""
+    network, settings = model.network, model.settings
+    if not (isinstance(network, ConvolutionNetwork) and isinstance(settings, ConvolutionSettings)):
+        raise ConfigError(f"`architecture` must be one of convolutions to have filters, got {settings.architecture!r}.")
+    return network, settings
+
+
+def _has_several_layers(model: Model) -> bool:
+    return len(_convolutions(model)[0].convs) > 1
+
+
+def _mean_window_sum(settings: ConvolutionSettings, sample: Sample) -> Tensor:
     """Mean over particles of ψ, by which normalised filters are divided."""
-    cutoff = model.settings.relative_cutoff
-    edges = radius_graph(sample.inputs.positions.double(), cutoff, sample.inputs.box)
-    values = window_values((edges.distances / edges.cutoff) ** 2, model.settings.window)
+    edges = radius_graph(sample.inputs.positions.double(), settings.relative_cutoff, sample.inputs.box)
+    values = window_values((edges.distances / edges.cutoff) ** 2, settings.window)
     return values.sum() / edges.num_receivers
 
 
 def _combination(learned: Tensor, analytic: Tensor, volume: Tensor, model: Model) -> Tensor:
     """Weights (C_out, C) of the layer's outputs: the target's units, or the nearest to the analytic filters."""
-    if len(model.network.convs) == 1:
+    if not _has_several_layers(model):
         return torch.diag(model.target_scale.double())
     read, root = _read_features(analytic), volume.sqrt()[:, None, None]
     terms, wanted = ((root * values[:, read]).flatten(0, 1) for values in (learned, analytic))
@@ -299,17 +315,26 @@ def _read_features(analytic: Tensor) -> Tensor:
     return analytic.abs().amax(dim=(0, 2)) > 0
 
 
+def _read_names(analytic: Tensor, features: Features) -> set[str]:
+    """Names of the features that the analytic operator reads; each component of a vector has its name."""
+    names = [
+        *features.scalar_names,
+        *(name for name in features.vector_names for _ in range(features.vectors.shape[2])),
+    ]
+    return {name for name, is_read in zip(names, _read_features(analytic), strict=True) if is_read}
+
+
 def _on_axes(filters: Tensor, pairs: _Pairs) -> Tensor:
     """Filters along each axis, (D, L, F, C)."""
     return filters[~pairs.ball].unflatten(0, (-1, len(pairs.line)))
 
 
-def _along_direction(filters: Tensor, pairs: _Pairs, features: Features, reads_density: bool) -> Tensor:
-    """The part along d/r of filters (P, F, C) of the density, or else of the velocities, by distance (K, M)."""
+def _along_direction(filters: Tensor, pairs: _Pairs, features: Features, read: Collection[str]) -> Tensor:
+    """The part along d/r of filters (P, F, C) by distance (K, M): of the density if it is read, else of velocities."""
     displacements = pairs.displacements[pairs.ball]
     directions = displacements / displacements.norm(dim=1, keepdim=True)
     answers = filters[pairs.ball]
-    if reads_density:
+    if DENSITY in read:
         vectors = answers[:, features.scalar_names.index(DENSITY)]
     else:
         vectors = split_kinds(answers[:, :, 0], features.kinds, directions.shape[1])[1][:, 0]

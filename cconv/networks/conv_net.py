@@ -27,10 +27,10 @@ from cconv.networks.counting import (
 )
 from cconv.networks.network import (
     Channels,
+    ConvolutionNetwork,
     ConvolutionSettings,
     Layers,
     LinearTerms,
-    Network,
     WallInputs,
     assign_rows,
     check_single_layer,
@@ -50,7 +50,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 SKIPS = ("before_activation", "after_activation", "none")
 
 
-class ConvNet(Network[ConvGeometry]):
+class ConvNet(ConvolutionNetwork[ConvGeometry, ContinuousConv]):
     """Particle network of the thesis, figure 3.1.
 
     Layer 0 concatenates boundary convolution, fluid convolution and fully connected layer, each of `channels.layers[0]`

@@ -166,6 +166,16 @@ def with_inputs(branch: Layer | None, walls: WallInputs[GeometryT] | None) -> li
     return [(branch, walls)]
 
 
+class ConvolutionNetwork(Network[GeometryT], Generic[GeometryT, Layer]):
+    """A network of stacked convolutions.
+
+    Attributes:
+        convs: Convolution of the fluid in each layer.
+    """
+
+    convs: Layers[Layer]
+
+
 def check_single_layer(layers: int) -> None:
     """Check that a network is linear in its coefficients.
 

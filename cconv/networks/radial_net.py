@@ -25,10 +25,10 @@ from cconv.networks.counting import (
 )
 from cconv.networks.network import (
     Channels,
+    ConvolutionNetwork,
     ConvolutionSettings,
     Layers,
     LinearTerms,
-    Network,
     WallInputs,
     assign_rows,
     check_single_layer,
@@ -77,7 +77,7 @@ class VectorLinear(nn.Module):
         return join_kinds(linear if self.bias is None else linear + self.bias, mapped)
 
 
-class RadialNet(Network[RadialGeometry]):
+class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
     """Network of scalars and vectors.
 
     Every layer adds a radial convolution and a linear map of its input, the first one a convolution of the boundary
