@@ -10,11 +10,8 @@ from cconv.evaluation.checks import CHECKS
 from cconv.evaluation.checks.check import Check
 from cconv.tasks import TASKS
 
-FLOWS = [
-    {"dim": dim, "walls": walls, "periodic": periodic}
-    for dim in (2, 3)
-    for walls, periodic in ((False, False), (True, False), (False, True), (True, True))
-]
+FLOWS = [{"dim": 2, "walls": walls, "periodic": periodic} for walls in (False, True) for periodic in (False, True)]
+FLOWS += [{"dim": 3, "walls": walls, "periodic": not walls} for walls in (False, True)]
 PAIRS = [(task, check) for task in TASKS for check in TASKS[task].checks]
 pairs = pytest.mark.parametrize(("task", "check"), PAIRS)
 

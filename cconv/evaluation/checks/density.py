@@ -24,7 +24,7 @@ class IntegratedDensity(Check):
     Only that integral is taken from stored frames, by the trapezoidal rule: what the rule misses of the rate itself,
     since frames may lie far apart, is common to both rates and cancels.
 
-    Source: the limit is the deviation that Neural SPH (Toshev et al. 2024) allows.
+    Source: the limit is that of Neural SPH (Toshev et al. 2024).
     """
 
     name = "density"

@@ -43,10 +43,10 @@ def stressed_states(
     scene: Scene,
     kernel: AbstractKernel,
     *,
-    typical_rate: float = 0.0,
-    fastest: float | None = None,
-    reach: float | None = None,
-    seed: int = 0,
+    typical_rate: float,
+    fastest: float,
+    reach: float,
+    seed: int,
 ) -> list[State]:
     """The frame as it is, and in the states in which methods fail.
 
@@ -60,13 +60,11 @@ def stressed_states(
         scene: Their scene.
         kernel: SPH kernel, which says how fast clumped pairs must approach to matter.
         typical_rate: Rate of density that is usual in the data.
-        fastest: Largest speed in the data; that of the frame by default.
-        reach: Largest distance that anything searches; the kernel's support by default.
+        fastest: Largest speed in the data.
+        reach: Largest distance that anything searches.
         seed: Seed of the choice of particles.
     """
     generator = torch.Generator().manual_seed(seed)
-    fastest = float(frame.velocities.double().norm(dim=1).max()) if fastest is None else fastest
-    reach = kernel.support_radius if reach is None else reach
     states = [
         State(name=AS_IT_IS, frame=frame, scene=scene),
         _clumped(frame, scene, kernel, typical_rate, generator),
