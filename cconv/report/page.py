@@ -7,7 +7,6 @@ from typing import cast
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cconv.files import write_text
@@ -41,7 +40,6 @@ def render_report(run: RunFolder) -> str:
         )
         for section in shown
     }
-    bodies = {name: Markup(body) for name, body in bodies.items()}
     page = templates.get_template("report.html.j2")
     return page.render(**known, state=run.read("state.json"), sections=shown, bodies=bodies)
 
@@ -77,9 +75,9 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.3g} seconds"
 
 
-def _table(table: pd.DataFrame) -> Markup:
+def _table(table: pd.DataFrame) -> str:
     """A table in HTML; pandas escapes what stands in it."""
-    return Markup(table.to_html(index=False, border=0, float_format=lambda value: f"{value:.4g}", na_rep="–"))
+    return table.to_html(index=False, border=0, float_format=lambda value: f"{value:.4g}", na_rep="–")
 
 
 def _png(figure: Figure) -> str:

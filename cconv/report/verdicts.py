@@ -6,7 +6,7 @@ import pandas as pd
 
 from cconv.study.records.summary import Finding, Summary
 
-ALL = "every check"  # stands in the place of a check for the row that sums all up
+ALL = "all"  # stands in the place of a check for the row that sums all up
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def verdicts_table(summary: Summary) -> pd.DataFrame:
     """
     names = [entry.id for entry in summary.finalists]
     stable = {entry.id: "yes" if entry.stability.stable else "no" for entry in summary.finalists}
-    rows = [{"check": ALL, "label": "passes", "limit": None} | stable] + [
+    rows = [{"check": ALL, "label": "passes every check", "limit": None} | stable] + [
         {"check": row.check, "label": row.label, "limit": row.limit}
         | {name: f"{cell.value:.3g}" for name, cell in zip(names, row.cells, strict=True)}
         for row in verdict_matrix(summary)
