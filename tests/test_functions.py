@@ -15,11 +15,7 @@ EXEMPT = {
     # Parameters of a command are its options.
     ("cli/data.py", "generate"),
     ("cli/data.py", "show"),
-    # To be shortened.
     ("cli/model.py", "evaluate"),
-    ("study/pipeline.py", "_session"),
-    ("study/running/trial.py", "run_trial"),
-    ("training/loop.py", "train"),
 }
 
 

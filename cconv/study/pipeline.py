@@ -4,7 +4,9 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import cache
 
+from cconv.data.dataset import Dataset
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
@@ -17,7 +19,7 @@ from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.study.records.summary import Summary
 from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
-from cconv.study.running.optuna_mirror import database_answers, open_mirror
+from cconv.study.running.optuna_mirror import OptunaMirror, database_answers, open_mirror
 from cconv.study.running.pool import Pool
 from cconv.study.running.private_folder import remove_left_behind
 from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
@@ -139,31 +141,18 @@ def _session(
     serial: bool,
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
-    dataset = open_study_data(study.data, study.seeds.data)
-    findings = dataset_findings(dataset, progress)
-    observer.on_data([str(finding) for finding in findings])
-    described = describe_environment(study, dataset, 1 if serial else study.concurrency)
-    run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
+    dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
         space = fixed(space, feature_path(WALLS))  # nothing to search where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
-    searches = [name for name, stage in study.stages.items() if isinstance(stage, SearchStage)]
-    records = [record for record in run.trials() if record.stage in searches]
-    pools = []
     with ExitStack() as stack:
         stack.enter_context(database_answers(storage_url))
-
-        def start_pool():
-            if not pools:
-                pools.append(stack.enter_context(_pool(study, problem, run, address, serial)))
-            return pools[0]
-
+        start_pool = cache(lambda: stack.enter_context(_pool(study, problem, run, address, serial)))
         if address is not None:
             start_pool()  # a cluster that is not there is told before anything is computed
-        name = study.name if storage_url is None else f"{study.name}-{run.read('study.json')['id']}"
-        mirror = open_mirror(run.path / "optuna.journal", storage_url, name, space, study.training.updates, records)
+        mirror = _mirror(study, space, run, storage_url)
         stack.callback(mirror.end_running)
         yield Session(
             study=study,
@@ -178,6 +167,26 @@ def _session(
             progress=progress,
             useless_error=problem.objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
         )
+
+
+def _described_data(
+    study: StudyConfig, run: RunFolder, observer: Observer, progress: Progress, workers: int
+) -> Dataset:
+    """The data of a study; findings about them are told, and recorded with all else that a run depends on."""
+    dataset = open_study_data(study.data, study.seeds.data)
+    findings = dataset_findings(dataset, progress)
+    observer.on_data([str(finding) for finding in findings])
+    described = describe_environment(study, dataset, workers)
+    run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
+    return dataset
+
+
+def _mirror(study: StudyConfig, space: SearchSpace, run: RunFolder, storage_url: str | None) -> OptunaMirror:
+    """The searches in Optuna's storage, as far as they have come."""
+    searches = [name for name, stage in study.stages.items() if isinstance(stage, SearchStage)]
+    records = [record for record in run.trials() if record.stage in searches]
+    name = study.name if storage_url is None else f"{study.name}-{run.read('study.json')['id']}"
+    return open_mirror(run.path / "optuna.journal", storage_url, name, space, study.training.updates, records)
 
 
 def _pool(
