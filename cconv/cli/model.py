@@ -4,7 +4,7 @@ import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,9 @@ from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import check_setting
+
+if TYPE_CHECKING:
+    from cconv.models.model import Model
 
 
 def train(
@@ -156,7 +159,7 @@ def evaluate(
     _print_evaluation(facts)
 
 
-def _errors_on(model, progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
+def _errors_on(model: "Model", progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
     """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
     from cconv.evaluation.metrics import own_variance, per_frame_normalized_mse
     from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse

@@ -123,12 +123,9 @@ def growth_table(summary: Summary) -> pd.DataFrame:
 
 def strategies_table(summary: Summary) -> pd.DataFrame:
     """One row a point of the best-so-far curve of each search strategy: strategy, updates spent, error."""
-    rows = [
-        {"strategy": name, "updates": updates, "error": error}
-        for name, strategy in summary.references.strategies.items()
-        for updates, error in strategy.curve
-    ]
-    return pd.DataFrame(rows)
+    strategies = summary.references.strategies if summary.references else {}
+    rows = [(name, *point) for name, strategy in strategies.items() for point in strategy.curve]
+    return pd.DataFrame(rows, columns=["strategy", "updates", "error"])
 
 
 def rung_audit_table(summary: Summary) -> pd.DataFrame:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -180,8 +180,8 @@ def _judge(session: Session, finalists: Sequence[Retrained]) -> _Judged:
 
 
 def _entry(finalist: Retrained, judged: _Judged, test: Errors, run: RunFolder) -> FinalistEntry:
-    facts, cost, stability = (each[finalist.id] for each in (judged.facts, judged.costs, judged.stability))
-    return finalist_entry(finalist, facts, test, cost, stability, run)
+    name = finalist.id
+    return finalist_entry(finalist, judged.facts[name], test, judged.costs[name], judged.stability[name], run)
 
 
 def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str, str]]:
@@ -286,7 +286,7 @@ def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[S
     frame = first[len(first) // 2]  # that of the start may be at rest
     for finalist in finalists:
         model = load_model(finalist.best_checkpoint)
-        arrays = explain(model, frame) | error_distribution(model, samples)
+        arrays: dict[str, Any] = explain(model, frame) | error_distribution(model, samples)
         np.savez_compressed(folder / f"{finalist.id}.npz", **arrays)
 
 
