@@ -322,14 +322,19 @@ def _ablation() -> Ablation:
         of="best",
         error=0.001,
         path=[_step("baseline", 0.016), _step("lost", None), _step("network.layers", 0.002)],
-        branches=[_step("walls", 0.00421, walls=True), _step("density", None, density=False)],
+        branches=[_toggled("walls", True, 0.00421), _toggled("density", False, None)],
     )
 
 
-def _step(change: str, error: float | None, **parameters) -> AblationStep:
+def _toggled(feature: str, is_taken: bool, error: float | None) -> AblationStep:
+    change = f"task.features.{feature}"
+    return _step(change, error, {change: is_taken})
+
+
+def _step(change: str, error: float | None, parameters: dict | None = None) -> AblationStep:
     return AblationStep(
         change=change,
-        parameters=parameters,
+        parameters=parameters or {},
         valid_error=error,
         low=error and error / 2,
         high=error and error * 2,

@@ -166,11 +166,11 @@ def test_nothing_half_written_remains(run):
 
 def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, summary):
     path = summary.ablation.path
-    space = fixed(SearchSpace.model_validate(run.read("space.json")), "boundary")
+    space = SearchSpace.model_validate(run.read("space.json"))
     assert path[0].parameters == space.baseline
     assert len(path) > 1
     assert all(step.valid_error > 0 for step in path)
-    (density,) = [entry for entry in summary.ablation.branches if entry.change == "density"]
+    (density,) = [entry for entry in summary.ablation.branches if entry.change == "task.features.density"]
     assert density.valid_error > 0
 
 

@@ -232,7 +232,7 @@ class Ablation(StrictModel):
         of: The best finalist.
         error: Its validation error, mean over the seeds.
         path: From the baseline to the best trained finalist, one change after the other.
-        branches: The best finalist with one branch or feature left out or added, named by `change`.
+        branches: The best finalist with one feature left out or added, whose path is the `change`.
     """
 
     of: Id

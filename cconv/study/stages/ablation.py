@@ -48,8 +48,10 @@ class AblationStage(Stage):
         ablation = Ablation(
             of=best.id,
             error=_mean_error(best),
-            path=[_step(session, name, change, each) for change, each in path.items()],
-            branches=[_step(session, name, branch, each) for branch, each in branches.items()],
+            path=[_step(session, f"{name}_{change}", change, each) for change, each in path.items()],
+            branches=[
+                _step(session, f"{name}_{feature}", feature_path(feature), each) for feature, each in branches.items()
+            ],
         )
         return Found(ablation=ablation)
 
@@ -109,8 +111,9 @@ def toggled(session: Session, best: Retrained) -> dict[str, dict]:
     return {name: parameters | {feature_path(name): name not in features} for name in offered}
 
 
-def _step(session: Session, stage: str, change: str, parameters: Mapping) -> AblationStep:
-    records = session.run.retrainings().get(f"{stage}_{change}", [])
+def _step(session: Session, trained: str, change: str, parameters: Mapping) -> AblationStep:
+    """What came of the trainings of a change, which have an id of their own."""
+    records = session.run.retrainings().get(trained, [])
     errors = [record.best for record in records if record.outcome == "completed"]
     return AblationStep(
         change=change,
