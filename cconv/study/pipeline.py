@@ -4,6 +4,7 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from typing import cast
 
 from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
@@ -13,6 +14,7 @@ from cconv.study.declared.search_space import check_baseline_affordable
 from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
+from cconv.study.records.found import Found
 from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.study.records.summary import Summary
 from cconv.study.running.counted_costs import CostCounter
@@ -123,7 +125,7 @@ def write_study(run: RunFolder, study: StudyConfig) -> None:
 
 def _run_stage(session: Session, name: str, stage: Stage) -> None:
     start = time.perf_counter()
-    found = stage.run(session, name)
+    found = cast(Found, stage.run(session, name))  # declarations know no records
     session.run.write_result(name, stage.kind, time.perf_counter() - start, found)
 
 
@@ -151,11 +153,11 @@ def _session(
     check_baseline_affordable(space, count_cost)
     searches = [name for name, stage in study.stages.items() if isinstance(stage, SearchStage)]
     records = [record for record in run.trials() if record.stage in searches]
-    pools = []
+    pools: list[Pool] = []
     with ExitStack() as stack:
         stack.enter_context(database_answers(storage_url))
 
-        def start_pool():
+        def start_pool() -> Pool:
             if not pools:
                 pools.append(stack.enter_context(_pool(study, problem, run, address, serial)))
             return pools[0]
