@@ -67,6 +67,11 @@ class TrialRecord:
         """Validation error of the last evaluation with a finite one, or None."""
         return self.last["valid_error"] if self.last else None
 
+    @property
+    def final_error(self) -> float | None:
+        """The last validation error of a training of the full budget; None for any other."""
+        return self.last_error if self.outcome == "completed" else None
+
 
 class TrialFolder:
     """Files of one trial: config.json, log.jsonl, outcome.json, checkpoint/, and its progress while it runs."""
