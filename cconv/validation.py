@@ -3,6 +3,7 @@
 import re
 import typing
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -13,11 +14,13 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
     PlainValidator,
     Strict,
     TypeAdapter,
     ValidationError,
 )
+from pydantic_core import CoreSchema, core_schema
 
 from cconv.errors import CConvError, ConfigError, did_you_mean, shown, visible
 
@@ -32,6 +35,16 @@ class OpenModel(BaseModel):
     """What must stand in a record, beside anything else."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Annotates a text that must be one of some names; another is refused as by a `Literal` of these names."""
+
+    names: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.literal_schema(list(self.names))
 
 
 Flag = Annotated[bool, Strict()]

@@ -49,7 +49,8 @@ def main() -> None:
         sys.exit(app(standalone_mode=False))
     except typer.TyperException as error:  # an option or argument that does not exist or cannot be
         if message := " ".join(error.format_message().split()):  # else help was asked for, and printed
-            help_of = error.ctx.command_path if getattr(error, "ctx", None) else "cconv"
+            context = getattr(error, "ctx", None)
+            help_of = context.command_path if context else "cconv"
             _print_refusal(f"{message.rstrip('.')}; see {help_of} --help.")
         sys.exit(2)
     except CConvError as error:

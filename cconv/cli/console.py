@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -17,10 +18,10 @@ class PlainConsole(Console):
     characters are written as escapes; whoever wants a style gives a `Text`.
     """
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any):
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
-    def render_str(self, text: str, **options) -> Text:
+    def render_str(self, text: str, **options: Any) -> Text:
         """The string as a `Text`, its lines kept."""
         plain = "\n".join(visible(line) for line in text.split("\n"))
         return super().render_str(plain, **options | {"markup": False, "emoji": False})

@@ -1,7 +1,7 @@
 """`cconv data`: make, look at and convert particle data."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -9,6 +9,10 @@ from rich.text import Text
 
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cconv.data.dataset import Dataset
+    from cconv.scenes.simulated_scene import SimulatedScene
 
 # Commands import what they run inside, as torch takes seconds to load and `--help` should not.
 
@@ -49,7 +53,7 @@ def scenes(as_json: AsJson = False) -> None:
     """List the scenes that `generate` makes, and what each has: walls, forces, a free surface ..."""
     from cconv.scenes import SCENES, scene_named
 
-    facts = [
+    facts: list[dict] = [
         {
             "scene": name,
             "dim": scene.dim,
@@ -73,7 +77,7 @@ def scenes(as_json: AsJson = False) -> None:
     results.print(table)
 
 
-def _size_of(scene) -> dict:
+def _size_of(scene: "SimulatedScene") -> dict:
     return {
         "particle_spacing": scene.particle_spacing,
         "time_step": scene.time_step,
@@ -278,7 +282,9 @@ def parse_vector(text: str) -> tuple[float, ...]:
         raise ConfigError(f"`--force` must be numbers separated by commas, such as 0,-9.81,0, got {text!r}.") from error
 
 
-def _open(path: Path, mass, particle_spacing, frame_dt, force: str | None):
+def _open(
+    path: Path, mass: float | None, particle_spacing: float | None, frame_dt: float | None, force: str | None
+) -> "Dataset":
     from cconv.data.dataset import open_dataset
 
     return open_dataset(

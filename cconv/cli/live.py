@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -10,6 +11,9 @@ from rich.progress import BarColumn, Progress
 from rich.table import Table
 
 from cconv.cli.console import plain_column, print_findings
+
+if TYPE_CHECKING:
+    from cconv.training.loop import TrainingState
 
 ROWS = 12
 
@@ -46,7 +50,7 @@ class StudyDisplay:
             self._live.start()
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         if self._live is not None:
             self._live.stop()
 
@@ -123,7 +127,8 @@ class TrainingBar:
     """
 
     def __init__(self, console: Console, name: str, updates: int):
-        self._console, self._updates, self._best = console, updates, None
+        self._console, self._updates = console, updates
+        self._best: float | None = None
         self._progress = Progress(
             plain_column("{task.description}"),
             BarColumn(),
@@ -137,11 +142,11 @@ class TrainingBar:
         self._progress.start()
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._progress.stop()
 
-    def on_update(self, state) -> None:
-        """Show a `TrainingState`."""
+    def on_update(self, state: "TrainingState") -> None:
+        """Show how far the training has come."""
         valid = state.valid_error
         if valid is not None:
             self._best = valid if self._best is None else min(self._best, valid)

@@ -1,5 +1,6 @@
 """`cconv study`: run a study, go on with it, give it more trials, look at its state."""
 
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -180,19 +181,13 @@ def status(
 
     folder = RunFolder.open(path)
     records = folder.trials()
-    completed = [record for record in records if record.outcome == "completed" and record.last]
-    best = min(completed, key=lambda record: record.last["valid_error"], default=None)
-    facts = {
-        **folder.read("state.json"),
-        "trials": count_outcomes(records),
-        "best": None
-        if best is None
-        else {
-            "trial": best.id,
-            "valid_error": best.last["valid_error"],
-            "parameters": best.parameters,
-        },
-    }
+    completed: list[dict] = [
+        {"trial": record.id, "valid_error": record.final_error, "parameters": record.parameters}
+        for record in records
+        if record.final_error is not None
+    ]
+    best = min(completed, key=itemgetter("valid_error"), default=None)
+    facts = {**folder.read("state.json"), "trials": count_outcomes(records), "best": best}
     if as_json:
         print_json(facts)
         return
@@ -200,8 +195,8 @@ def status(
     for stage, counts in facts["trials"].items():
         results.print(f"{stage}: " + ", ".join(f"{number} {name}" for name, number in counts.items() if number))
     if best is not None:
-        settings = " ".join(f"{key}={value}" for key, value in best.parameters.items())
-        results.print(f"best: {best.id}, validation error {best.last['valid_error']:.4g} ({settings})")
+        settings = " ".join(f"{key}={value}" for key, value in best["parameters"].items())
+        results.print(f"best: {best['trial']}, validation error {best['valid_error']:.4g} ({settings})")
 
 
 def _finalists_table(summary: "Summary") -> Table:

@@ -280,7 +280,7 @@ def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tu
 
     Each turn has an order of its own, as a call leaves the caches to the next one.
     """
-    times = {name: [] for name in calls}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     orders = random.Random(0)
     for turn in range(repeats + 1):
         for name in orders.sample(list(calls), len(calls)):

@@ -15,7 +15,7 @@ def decidable(importance: Sequence[RungImportance]) -> list[str]:
 
 def _sentence(entry: RungImportance) -> str:
     after = f"After {entry.updates:,} updates"
-    if entry.why_none:
+    if entry.detectable_share is None:
         return f"{after} no importance is given: {entry.why_none}."
     percent = min(math.ceil(100 * entry.detectable_share), _AT_MOST)
     return (
@@ -26,7 +26,7 @@ def _sentence(entry: RungImportance) -> str:
 
 
 def _found(entry: RungImportance) -> Iterator[str]:
-    decided = [(name, each) for name, each in entry.parameters.items() if each.decided]
+    decided = [(name, each.tested) for name, each in entry.parameters.items() if each.decided and each.tested]
     for name, each in sorted(decided, key=lambda item: -item[1].share):
         interval = f"95 % interval {100 * each.low:.0f} to {100 * each.high:.0f} %"
         yield f"{name} ({100 * each.share:.0f} %, {interval})"

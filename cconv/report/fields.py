@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from cconv.errors import DataError
 from cconv.report.colors import ANALYTIC_COLOR, MARKED
-from cconv.report.plots import new_figure
+from cconv.report.plots import new_figure, new_panels
 from cconv.study.records.run_folder import RunFolder
 
 Explanation = Mapping[str, np.ndarray]
@@ -38,7 +38,7 @@ def filters_chart(explanation: Explanation) -> Figure:
     """
     dim = len(explanation["learned_on_axes"])
     spacing = float(explanation["particle_spacing"])
-    figure, panels = new_figure(3.6 * (dim + 1), 3.6, columns=dim + 1)
+    figure, panels = new_panels(3.6 * (dim + 1), 3.6, columns=dim + 1)
     for axis, axes in enumerate(panels[:-1]):
         _draw_axis(axes, explanation, axis, spacing)
     _draw_radial(panels[-1], explanation, spacing)
@@ -64,7 +64,7 @@ def fields_chart(explanation: Explanation, symbol: str) -> Figure:
     error = np.sqrt(explanation["error"][shown])
     if target.shape[1] > 1:
         target, prediction, symbol = _size(target), _size(prediction), f"|{symbol}|"
-    figure, panels = new_figure(13, 3.9, columns=3)
+    figure, panels = new_panels(13, 3.9, columns=3)
     limit = float(np.quantile(np.abs(target), 0.99)) or 1.0
     signed = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     scale = signed if np.any(target < 0) else {"cmap": "viridis", "vmin": 0, "vmax": limit}
@@ -124,8 +124,8 @@ def _draw_radial(axes: Axes, explanation: Explanation, spacing: float) -> None:
     radii = explanation["radii"] / spacing
     axes.plot(radii, explanation["analytic_radial"], color=ANALYTIC_COLOR, lw=3, alpha=0.25, label="analytic: W'(r)")
     axes.plot(radii, explanation["learned_radial"], color=_LEARNED, lw=1.4, label="learned, mean over directions")
-    band = {"color": _LEARNED, "alpha": 0.2, "lw": 0, "label": "9 of 10 directions"}
-    axes.fill_between(radii, explanation["learned_radial_low"], explanation["learned_radial_high"], **band)
+    low, high = explanation["learned_radial_low"], explanation["learned_radial_high"]
+    axes.fill_between(radii, low, high, color=_LEARNED, alpha=0.2, lw=0, label="9 of 10 directions")
     axes.set(xlabel="distance r [spacings]", title="part along the direction d/r")
     axes.legend(fontsize=8)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import seaborn as sns
 from matplotlib.axes import Axes
@@ -71,15 +72,15 @@ def _by_share(entry: RungImportance) -> list[str]:
 
 
 def _shares(axes: Axes, entry: RungImportance, names: Sequence[str]) -> None:
-    tested = [(row, entry.parameters[name]) for row, name in enumerate(names)]
-    tested = [(row, each) for row, each in tested if each.share is not None]
+    judged = [entry.parameters[name] for name in names]
+    tested = {row: each.tested for row, each in enumerate(judged) if each.tested is not None}
     for decided, color, label in ((True, _FOUND, "found"), (False, _OPEN, "not found, which is not absent")):
-        rows = [row for row, each in tested if each.decided is decided]
-        axes.barh(rows, [each.share for row, each in tested if row in rows], color=color, height=0.65, label=label)
-    rows, lows, highs = zip(*((row, each.low, each.high) for row, each in tested), strict=True)
-    axes.hlines(rows, lows, highs, color="0.15", lw=1.2, label="95 % interval of the share")
-    label = "found four times in five from here on"
-    axes.axvline(entry.detectable_share, color=_LIMIT, ls="--", lw=1.2, label=label)
+        rows = [row for row in tested if judged[row].decided is decided]
+        axes.barh(rows, [tested[row].share for row in rows], color=color, height=0.65, label=label)
+    lows, highs = [each.low for each in tested.values()], [each.high for each in tested.values()]
+    axes.hlines(list(tested), lows, highs, color="0.15", lw=1.2, label="95 % interval of the share")
+    detectable = cast(float, entry.detectable_share)  # which an entry with importances has
+    axes.axvline(detectable, color=_LIMIT, ls="--", lw=1.2, label="found four times in five from here on")
     axes.set_yticks(range(len(names)), names)
     axes.grid(axis="y", visible=False)
     axes.set_title("share of the variance that it decides alone", fontsize=11)

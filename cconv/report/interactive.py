@@ -1,6 +1,7 @@
 """The chart of a study to hover over: error against time per frame, with the hyperparameters of every point."""
 
 import math
+from typing import Any
 
 import pandas as pd
 import plotly.graph_objects as go
@@ -130,7 +131,8 @@ def _hover(points: pd.DataFrame) -> dict:
     return {"hovertext": [_description(row) for row in points.itertuples(index=False)], "hoverinfo": "text"}
 
 
-def _description(row) -> str:
+def _description(row: Any) -> str:
+    """What is shown of a point, given its row of `speed_accuracy_table`."""
     tested = row.kind == "finalist"
     error = f"{'test' if tested else 'validation'} error {row.error:.4g}"
     if tested and not math.isnan(row.error_low):
@@ -145,5 +147,5 @@ def _description(row) -> str:
     return "<br>".join([*lines, *settings])
 
 
-def _short(value) -> str:
+def _short(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -59,8 +59,10 @@ def _number(value: float | int | bool | str | None, digits: int = 3) -> str:
     """A value for a reader: whole numbers in full, others with so many digits, "–" for none."""
     if value is None or value != value:  # nan
         return "–"
-    if isinstance(value, bool | str):
-        return {True: "yes", False: "no"}.get(value, str(value))
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, int):
         return f"{value:,}"
     rounded = float(f"{value:.{digits}g}")

@@ -20,6 +20,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import Normalize, to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from cconv.data.folders import whole_file
@@ -38,6 +39,7 @@ _TYPE_COLORS = {
     ParticleType.MOVING_WALL: "#dd8452",
     ParticleType.RIGID: "#55a868",
 }
+_RGBA = tuple[float, float, float, float]
 _WALL_COLOR, _BOUNDARY_COLOR = "#b3b3b3", "#cccccc"
 
 
@@ -203,7 +205,11 @@ def _by_type(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _By
     return _ByType(trajectory.particle_types.numpy(), scene.dim == 2 and trajectory.boundary is not None)
 
 
-COLORINGS = {"speed": _by_speed, "density": _by_density, "type": _by_type}
+COLORINGS: dict[str, Callable[[Trajectory, Scene, Iterable[int]], _Coloring]] = {
+    "speed": _by_speed,
+    "density": _by_density,
+    "type": _by_type,
+}
 
 
 def _coloring(color: str, trajectory: Trajectory, scene: Scene, frames: Sequence[int], progress: Progress) -> _Coloring:
@@ -241,11 +247,11 @@ class _Stage(Protocol):
 class _Plane:
     """Two dimensions: discs of area dx^2."""
 
-    projection = None
+    projection: str | None = None
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self.aspect = scene.box.lengths[0] / scene.box.lengths[1]
+        self.aspect: float = scene.box.lengths[0] / scene.box.lengths[1]
 
     def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
         box = self._scene.box
@@ -257,25 +263,26 @@ class _Plane:
     def draw(self, axes: Axes, frame: Frame, colors: np.ndarray) -> Artist:
         return self._discs(axes, frame.positions.numpy(), colors)
 
-    def _discs(self, axes: Axes, points: np.ndarray, colors) -> EllipseCollection:
+    def _discs(self, axes: Axes, points: np.ndarray, colors: np.ndarray | _RGBA) -> EllipseCollection:
         width = [math.sqrt(4 / math.pi) * self._scene.particle_spacing]
         discs = EllipseCollection(
             width, width, [0], units="xy", offsets=points, offset_transform=axes.transData, facecolors=colors, lw=0
         )
-        return axes.add_collection(discs, autolim=False)
+        axes.add_collection(discs, autolim=False)
+        return discs
 
 
 class _Space:
     """Three dimensions, seen from above; the axis of the force is vertical, y where no force is known."""
 
-    projection = "3d"
-    aspect = 0.85
+    projection: str | None = "3d"
+    aspect: float = 0.85
 
     def __init__(self, scene: Scene):
         self._scene = scene
         self._vertical = "xyz"[int(np.argmax(np.abs(scene.force)))] if scene.force else "y"
 
-    def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes3D, trajectory: Trajectory) -> None:
         box = self._scene.box
         for axis, low, high in zip("xyz", box.lower, box.upper, strict=True):
             axes.set(**{f"{axis}lim": (low, high)})
@@ -286,7 +293,7 @@ class _Space:
         axes.view_init(elev=20, azim=-60, vertical_axis=self._vertical)
         axes.set_box_aspect(box.lengths)  # after the view, which turns it
 
-    def draw(self, axes: Axes, frame: Frame, colors: np.ndarray) -> Artist:
+    def draw(self, axes: Axes3D, frame: Frame, colors: np.ndarray) -> Artist:
         diameter = math.cbrt(6 / math.pi) * self._scene.particle_spacing * _points_per_length(axes, self._scene)
         colors = np.where(_is_wall(frame.particle_types.numpy())[:, None], to_rgba(_BOUNDARY_COLOR, 0.05), colors)
         return axes.scatter(
@@ -300,7 +307,7 @@ class _Space:
         )
 
 
-def _points_per_length(axes: Axes, scene: Scene) -> float:
+def _points_per_length(axes: Axes3D, scene: Scene) -> float:
     """Printer's points that a unit of length in the plane of view takes, under parallel projection."""
     corners = np.array(scene.box.lower) + np.vstack([np.zeros(3), np.diag(scene.box.lengths)])
     pixels = axes.transData.transform(np.stack(proj_transform(*corners.T, axes.get_proj())[:2], axis=1))

@@ -1,16 +1,19 @@
 """Charts of a study. Each function returns a matplotlib figure of its own; showing or saving it is the caller's."""
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import pandas as pd
 import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.typing import ColorType
 
 from cconv.report.colors import MARKED, MEAN_COLOR, stage_colors
 from cconv.report.tables import AUDIT_MEASURES, MEAN_PREDICTOR, growth_table, rung_audit_table, strategies_table
 from cconv.report.verdicts import verdict_matrix
 from cconv.study.declared.stage import BASELINE
+from cconv.study.records.found import Ablation
 from cconv.study.records.summary import Summary
 
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1)}  # a legend that hides no point
@@ -24,21 +27,18 @@ def learning_curves_chart(curves: pd.DataFrame, summary: Summary | None = None) 
         summary: Tells what errors are called, and that of predicting the mean, drawn as a line; None where the study
             has not finished.
     """
-    figure, (search, finals) = new_figure(11, 4.2, columns=2)
+    figure, (search, finals) = new_panels(11, 4.2, columns=2)
     trials, retrained = curves[~curves["retrained"]], curves[curves["stage"] == "finalists"]
     stages = stage_colors(list(trials["stage"].unique()))
     for (_, stage), curve in trials.groupby(["name", "stage"]):
-        style = {"color": stages[stage], "alpha": 0.6, "marker": ".", "lw": 1}
-        search.plot(curve["updates"], curve["valid_error"], **style)
+        search.plot(curve["updates"], curve["valid_error"], color=stages[stage], alpha=0.6, marker=".", lw=1)
     for stage, color in stages.items():
         search.plot([], [], color=color, label=stage)
     challengers = sorted(set(retrained["name"]) - {BASELINE})
     palette = sns.color_palette("husl", len(challengers))
     colors = {BASELINE: MARKED["baseline"]} | dict(zip(challengers, palette, strict=True))
     for name, lines in retrained.groupby("name"):
-        for number, (_, curve) in enumerate(lines.groupby("seed")):
-            style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
-            finals.plot(curve["updates"], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
+        _draw_seeds(finals, lines, "updates", name, colors[name])
     for axes, title in ((search, "search"), (finals, "finalists, one line a seed")):
         axes.set(yscale="log", xlabel="gradient updates", ylabel=_error_label(summary), title=title)
         if summary is not None:
@@ -54,16 +54,14 @@ def budget_chart(curves: pd.DataFrame, summary: Summary) -> Figure:
         curves: Evaluations as `curves_table` gives them.
         summary: Names the finalists, each of which has a colour.
     """
-    figure, panels = new_figure(12, 4.4, columns=2)
+    figure, panels = new_panels(12, 4.4, columns=2)
     finalists = [entry.id for entry in summary.finalists]
     is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_error"].notna()
     shown = curves[is_shown]
     colors = dict(zip(finalists, sns.color_palette("husl", len(finalists)), strict=True))
     for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
         for name, lines in shown.groupby("name", sort=False):
-            for number, (_, curve) in enumerate(lines.groupby("seed")):
-                style = {"color": colors[name], "label": None if number else name, "lw": 1.2}
-                axes.plot(curve[x], curve["valid_error"], marker="." if len(curve) == 1 else "", **style)
+            _draw_seeds(axes, lines, x, name, colors[name])
         axes.set(yscale="log", xlabel=label, ylabel=_error_label(summary))
     trained = shown["updates"][shown["updates"] > 0]
     panels[0].set_xscale("symlog", linthresh=trained.min() if len(trained) else 1)  # least squares takes no update
@@ -112,7 +110,7 @@ def rung_audit_chart(summary: Summary) -> Figure:
     The rank correlation has its 95 % interval, from twelve trials on. A rung that too few trials reached has no point.
     """
     table = rung_audit_table(summary)
-    figure, panels = new_figure(10, 3.3, columns=len(AUDIT_MEASURES))
+    figure, panels = new_panels(10, 3.3, columns=len(AUDIT_MEASURES))
     panels[0].vlines(table["updates"], table["spearman_low"], table["spearman_high"])
     for axes, name in zip(panels, AUDIT_MEASURES, strict=True):
         axes.plot(table["updates"], table[name].astype(float), marker="o")
@@ -129,8 +127,8 @@ def growth_chart(summary: Summary) -> Figure:
     for name, times in growth_table(summary).groupby("model", sort=False):
         label = f"{name}: ∝ N^{exponents[name]:.2f}" if name in exponents else name
         (line,) = axes.plot(times["num_particles"], times["ms_per_frame"], marker="o", label=label)
-        band = {"color": line.get_color(), "alpha": 0.2, "lw": 0}
-        axes.fill_between(times["num_particles"], times["ms_low"], times["ms_high"], **band)
+        particles, color = times["num_particles"], line.get_color()
+        axes.fill_between(particles, times["ms_low"], times["ms_high"], color=color, alpha=0.2, lw=0)
     axes.set(xscale="log", yscale="log", xlabel="particles N", ylabel="time per frame [ms]", title="growth of the cost")
     _legend(axes, **_BESIDE)
     return figure
@@ -166,8 +164,12 @@ def stability_chart(summary: Summary) -> Figure:
 
 
 def ablation_chart(summary: Summary) -> Figure:
-    """Validation error on the way from the baseline to the best, one change after the other, each retrained."""
-    path = pd.DataFrame(map(dict, summary.ablation.path))
+    """Validation error on the way from the baseline to the best, one change after the other, each retrained.
+
+    Args:
+        summary: That of a study with an ablation.
+    """
+    path = pd.DataFrame(map(dict, cast(Ablation, summary.ablation).path))
     figure, axes = new_figure(8, 1.2 + 0.38 * len(path))
     error, low, high = (path[name].astype(float) for name in ("valid_error", "low", "high"))
     places, bars = range(len(path)), [(error - low).clip(lower=0), (high - error).clip(lower=0)]
@@ -190,17 +192,30 @@ def mark_mean_predictor(draw_line: Callable, error: float) -> None:
     draw_line(error, color=MEAN_COLOR, lw=1.2, ls="--", label=f"{MEAN_PREDICTOR}: {error:.3g}")
 
 
-def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Axes]:
-    """An empty figure in the style of the report, width and height in inches, with its axes side by side."""
+def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """An empty figure in the style of the report, width and height in inches, with its axes."""
+    figure, (axes,) = new_panels(width, height, columns=1)
+    return figure, axes
+
+
+def new_panels(width: float, height: float, columns: int) -> tuple[Figure, list[Axes]]:
+    """An empty figure in the style of the report, width and height in inches, with several axes side by side."""
     with sns.axes_style("whitegrid"):
         figure = Figure(figsize=(width, height), layout="constrained")
-        return figure, figure.subplots(1, columns)
+        return figure, list(figure.subplots(1, columns, squeeze=False).flat)
+
+
+def _draw_seeds(axes: Axes, lines: pd.DataFrame, x: str, name: str, color: ColorType) -> None:
+    """Draw the validation errors of a finalist against a column of `lines`, one line a seed."""
+    for number, (_, curve) in enumerate(lines.groupby("seed")):
+        marker, label = "." if len(curve) == 1 else "", None if number else name
+        axes.plot(curve[x], curve["valid_error"], marker=marker, color=color, label=label, lw=1.2)
 
 
 def _error_label(summary: Summary | None) -> str:
     return "validation error" if summary is None else f"validation error ({summary.task.error})"
 
 
-def _legend(axes: Axes, **place) -> None:
+def _legend(axes: Axes, **place: Any) -> None:
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8, **place)

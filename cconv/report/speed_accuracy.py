@@ -3,15 +3,17 @@
 Finalists stand out, with intervals; trials and closed forms of the search are small and faded.
 """
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pandas as pd
-import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
-from cconv.report.plots import mark_mean_predictor
+from cconv.report.plots import mark_mean_predictor, new_figure
 from cconv.report.tables import ANALYTIC, speed_accuracy_table
 from cconv.study.records.summary import Summary
 
@@ -28,9 +30,7 @@ def speed_accuracy_chart(summary: Summary) -> Figure:
     """
     points = speed_accuracy_table(summary)
     finalists = points[points["kind"] == "finalist"].sort_values("error", ascending=False)
-    with sns.axes_style("whitegrid"):
-        figure = Figure(figsize=(10.5, max(5.5, 0.42 * len(finalists))), layout="constrained")
-        axes = figure.subplots()
+    figure, axes = new_figure(10.5, max(5.5, 0.42 * len(finalists)))
     axes.set(xscale="log", yscale="log", xlabel="time per frame [ms]", ylabel=f"error ({summary.task.error})")
     _draw_search(axes, points[points["kind"] == "search"])
     _draw_front(axes, summary, finalists)
@@ -62,10 +62,10 @@ def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
     colors = stage_colors(list(search["group"].unique()))
     for stage, trials in search.groupby("group", sort=False):
         filled = trials["outcome"] == "completed"
-        style = {"s": 16, "alpha": 0.5, "linewidths": 0.8, "edgecolors": colors[stage], "zorder": 2}
-        axes.scatter(trials["ms"][filled], trials["error"][filled], color=colors[stage], label=stage, **style)
+        draw = partial(axes.scatter, s=16, alpha=0.5, linewidths=0.8, edgecolors=colors[stage], zorder=2)
+        draw(trials["ms"][filled], trials["error"][filled], color=colors[stage], label=stage)
         label = None if filled.any() else stage
-        axes.scatter(trials["ms"][~filled], trials["error"][~filled], facecolors="none", label=label, **style)
+        draw(trials["ms"][~filled], trials["error"][~filled], facecolors="none", label=label)
     if (search["outcome"] != "completed").any():
         axes.scatter([], [], s=16, facecolors="none", edgecolors="0.5", label="stopped early")
 
@@ -74,11 +74,12 @@ def _draw_front(axes: Axes, summary: Summary, finalists: pd.DataFrame) -> None:
     front = finalists[finalists["on_front"]].sort_values("ms")
     axes.step(front["ms"], front["error"], where="post", color="0.35", lw=1.2, zorder=3, label="front by validation")
     ms, low, high = zip(*((step.ms_per_frame, step.low, step.high) for step in summary.front.attainment), strict=True)
-    band = {"color": "0.5", "alpha": 0.2, "lw": 0, "label": "front, 8 of 10 draws of a seed each"}
-    axes.fill_between(ms, low, high, step="post", **band)
+    label = "front, 8 of 10 draws of a seed each"
+    axes.fill_between(ms, low, high, step="post", color="0.5", alpha=0.2, lw=0, label=label)
 
 
-def _draw_finalist(axes: Axes, row) -> None:
+def _draw_finalist(axes: Axes, row: Any) -> None:
+    """Draw a finalist with its intervals, given its row of `speed_accuracy_table`."""
     marker, size = _MARKERS[row.group]
     has_interval = not np.isnan(row.error_low)
     axes.errorbar(
@@ -100,8 +101,14 @@ def _draw_analytic(axes: Axes, analytic: pd.DataFrame) -> None:
     for row in analytic.itertuples():
         edge = axes.get_ylim()[0]
         axes.plot(row.ms, edge, "^", color=ANALYTIC_COLOR, markersize=10, clip_on=False, zorder=6)
-        place = {"xytext": (9, 6), "textcoords": "offset points", "fontsize": 8}
-        axes.annotate(f"{ANALYTIC} (error 0)", (row.ms, edge), color=ANALYTIC_COLOR, **place)
+        axes.annotate(
+            f"{ANALYTIC} (error 0)",
+            (row.ms, edge),
+            xytext=(9, 6),
+            textcoords="offset points",
+            fontsize=8,
+            color=ANALYTIC_COLOR,
+        )
 
 
 def _name_in_margin(axes: Axes, finalists: pd.DataFrame) -> None:

@@ -5,6 +5,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cache
+from typing import cast
 
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import dataset_findings
@@ -15,6 +16,7 @@ from cconv.study.declared.search_space import check_baseline_affordable
 from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
+from cconv.study.records.found import Found
 from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.study.records.summary import Summary
 from cconv.study.running.counted_costs import CostCounter
@@ -125,7 +127,7 @@ def write_study(run: RunFolder, study: StudyConfig) -> None:
 
 def _run_stage(session: Session, name: str, stage: Stage) -> None:
     start = time.perf_counter()
-    found = stage.run(session, name)
+    found = cast(Found, stage.run(session, name))  # declarations know no records
     session.run.write_result(name, stage.kind, time.perf_counter() - start, found)
 
 

@@ -3,7 +3,8 @@
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Union
+from types import GenericAlias
+from typing import Annotated, Any, ClassVar, Union
 
 from pydantic import Field, create_model
 
@@ -28,14 +29,14 @@ def default_stages() -> dict[str, Stage]:
 
 def study_form(stages: Sequence[type[Stage]]) -> type[StudyConfig]:
     """The form of a study file that can ask for these classes of stages; at least two."""
-    any_stage = Annotated[Union[tuple(stages)], Field(discriminator="kind")]  # noqa: UP007, the members are a list
-    by_name = Field(default_factory=default_stages, min_length=1, max_length=100)
+    any_stage: Any = Annotated[Union[tuple(stages)], Field(discriminator="kind")]  # noqa: UP007, the members are a list
+    by_name: Any = GenericAlias(dict, (Name, any_stage))
     return create_model(
         "Study",
         __base__=StudyConfig,
         __module__=__name__,
         kinds=(ClassVar[tuple[str, ...]], tuple(map(kind_of, stages))),
-        stages=(dict[Name, any_stage], by_name),
+        stages=(by_name, Field(default_factory=default_stages, min_length=1, max_length=100)),
     )
 
 

@@ -16,4 +16,5 @@ class AblationSection(Section):
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
         """The errors along the path, if there is one."""
-        return {"chart": ablation_chart(summary) if summary.ablation.path else None}
+        has_path = summary.ablation is not None and summary.ablation.path
+        return {"chart": ablation_chart(summary) if has_path else None}

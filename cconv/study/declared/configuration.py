@@ -12,7 +12,7 @@ from cconv.sph.kernels import KERNELS
 from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
-from cconv.validation import Length, Real, StrictModel, Value, Whole
+from cconv.validation import Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
@@ -35,7 +35,7 @@ class TaskConfig(StrictModel):
     takes all features of the task.
     """
 
-    name: Literal[tuple(TASKS)]
+    name: Annotated[str, OneOf(tuple(TASKS))]
     kernel: str = "cubic_spline"
     smoothing_length: Length | None = None
     features: tuple[str, ...] | None = Field(None, max_length=100)
@@ -110,10 +110,10 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
         ConfigError: If a name is not that of a hyperparameter, or they are not possible together.
     """
     _check_known(parameters)
-    _check_named(parameters)
+    architecture = _architecture(parameters, defaults)
+    _check_features(parameters)
     taken, drawn = below(FEATURES, parameters), below(NETWORK, parameters)
     features = dict.fromkeys((*defaults.features, *(name for name in OPTIONAL_FEATURES if taken.get(name))))
-    architecture = drawn.get("architecture", defaults.network.architecture)
     settings = ARCHITECTURES[architecture]
     kept = {name: value for name, value in defaults.network.model_dump().items() if name in settings.model_fields}
     try:
@@ -137,11 +137,16 @@ def _check_known(parameters: Mapping[str, Value]) -> None:
             raise ConfigError(f"unknown hyperparameter {shown(name)}.{known_hyperparameters(name)}")
 
 
-def _check_named(parameters: Mapping[str, Value]) -> None:
-    """Check what names an architecture or a feature."""
-    architecture = parameters.get(ARCHITECTURE)
-    if architecture is not None and architecture not in ARCHITECTURES:
+def _architecture(parameters: Mapping[str, Value], defaults: Configuration) -> str:
+    """The architecture that is drawn, or the study's own."""
+    architecture = parameters.get(ARCHITECTURE, defaults.network.architecture)
+    if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
         raise ConfigError(f"not possible ({ARCHITECTURE}: must be one of {', '.join(ARCHITECTURES)})")
+    return architecture
+
+
+def _check_features(parameters: Mapping[str, Value]) -> None:
+    """Check that whether a feature is taken is true or false."""
     for path in map(feature_path, OPTIONAL_FEATURES):
         if not isinstance(parameters.get(path, True), bool):
             raise ConfigError(f"not possible ({path}: must be true or false)")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -21,10 +21,6 @@ def _at(where: tuple[str, ...], problem: str, came: object) -> ValidationError:
     """A validation error at a key of the space."""
     kind = PydanticCustomError("condition", "{problem}", {"problem": problem})
     return ValidationError.from_exception_data("SearchSpace", [InitErrorDetails(type=kind, loc=where, input=came)])
-
-
-def _is_number(value: object, kind) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 class _Parameter(StrictModel):
@@ -63,10 +59,15 @@ class Choice(_Parameter):
 
 
 class _Range(_Parameter):
+    """What both kinds of numbers share; true is no number."""
+
     scale: Literal["linear", "log"] = "linear"
+    type: Literal["int", "float"]
+    range: tuple[_Real, _Real]
+    baseline: _Real
 
     @model_validator(mode="after")
-    def _baseline_is_inside(self):
+    def _baseline_is_inside(self) -> Self:
         low, high = self.range
         if not low < high:
             raise ValueError(f"the range [{low}, {high}] must have its lower end first")
@@ -81,6 +82,9 @@ class _Range(_Parameter):
         """Values that must all be possible."""
         return list(self.range)
 
+    def _spans(self, value: float) -> bool:
+        return not isinstance(value, bool) and self.range[0] <= value <= self.range[1]
+
 
 class IntRange(_Range):
     """A whole number, both ends included."""
@@ -91,19 +95,17 @@ class IntRange(_Range):
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return _is_number(value, int) and self.range[0] <= value <= self.range[1]
+        return isinstance(value, int) and self._spans(value)
 
 
 class FloatRange(_Range):
     """A real number."""
 
     type: Literal["float"]
-    range: tuple[_Real, _Real]
-    baseline: _Real
 
     def holds(self, value: Value) -> bool:
         """Whether a value is in the domain."""
-        return _is_number(value, int | float) and self.range[0] <= value <= self.range[1]
+        return isinstance(value, int | float) and self._spans(value)
 
 
 Parameter = Annotated[Choice | IntRange | FloatRange, Field(discriminator="type")]
@@ -208,7 +210,7 @@ def narrowed(space: SearchSpace, domains: Mapping[str, Parameter]) -> SearchSpac
 
     Conditions on values that are gone lose them; a parameter that can no longer become active is left out.
     """
-    parameters = space.parameters | domains
+    parameters = {**space.parameters, **domains}
     kept: dict[str, Parameter] = {}
     for name in space.parents_first:
         when = {

@@ -1,22 +1,24 @@
 """Paths into a study file, such as `network.kernel_size`: they are the names of hyperparameters."""
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import TypeGuard, TypeVar
 
 Each = TypeVar("Each")
 
 
-def is_table(value: object) -> bool:
+def is_table(value: object) -> TypeGuard[Mapping[str, object]]:
     """Whether a value is a table of a file."""
     return isinstance(value, Mapping)
 
 
-def is_table_of_tables(value: object) -> bool:
+def is_table_of_tables(value: object) -> TypeGuard[Mapping[str, object]]:
     """Whether a value is a table that holds nothing but tables."""
     return isinstance(value, Mapping) and bool(value) and all(map(is_table, value.values()))
 
 
-def by_path(tables: Mapping[str, object], goes_on: Callable[[object], bool] = is_table) -> dict[str, object]:
+def by_path(
+    tables: Mapping[str, object], goes_on: Callable[[object], TypeGuard[Mapping[str, object]]] = is_table
+) -> dict[str, object]:
     """Values of nested tables by their paths; a path may also be written as one quoted key.
 
     Args:

@@ -121,7 +121,7 @@ def hypervolume_interval(
     steps = np.diff(np.log10([*(cost[name] for name in front), corner_cost]))
     shape = next(iter(logarithms.values())).shape
     deviations = sum(
-        (step * (table.mean() - table) for step, table in zip(steps, map(logarithms.get, front), strict=True)),
+        (step * (table.mean() - table) for step, table in zip(steps, map(logarithms.__getitem__, front), strict=True)),
         np.zeros(shape),
     )
     interval = mean_interval(area + deviations)

@@ -25,7 +25,7 @@ from cconv.study.records.found import ParameterImportance, RungImportance
 from cconv.study.records.trials import TrialRecord
 
 _TREES = 12
-_NONE = {"detectable_share": None, "surrogate_r2": None, "best_share": None, "parameters": {}}
+_NONE: dict = {"detectable_share": None, "surrogate_r2": None, "best_share": None, "parameters": {}}
 _BEST_SHARE, _FEWEST_BEST = 0.1, 5  # PED-ANOVA's best trials: a tenth, but no fewer than Optuna advises
 
 
@@ -119,7 +119,7 @@ def _tests(
     found = {name: effects(each, targets) for name, each in columns.items()}
     testable = [name for name, effect in found.items() if effect.is_testable]
     p_values = adjusted_p_values([columns[name] for name in testable], targets, seed=seed)
-    untested = {"share": None, "low": None, "high": None, "p_value": None, "decided": False}
+    untested: dict[str, float | None] = {"share": None, "low": None, "high": None, "p_value": None, "decided": False}
     judged = dict.fromkeys(found, untested)
     for name, p_value in zip(testable, p_values, strict=True):
         low, high = found[name].interval95

@@ -8,8 +8,10 @@ hypergeometric. The baseline and the best trial always stay in.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
+from functools import partial
+from operator import eq, itemgetter
 from pathlib import Path
+from typing import Generic, TypeVar, cast
 
 import tomli_w
 from scipy.stats import hypergeom
@@ -25,8 +27,11 @@ SIGNIFICANCE = 0.01  # chance to give up what has no influence
 MARGIN = 0.1  # of the range, beyond the best trials
 
 
+Drawn = TypeVar("Drawn", bound=Value)
+
+
 @dataclass(frozen=True)
-class _Evidence:
+class _Evidence(Generic[Drawn]):
     """Trials in which a parameter is active.
 
     Attributes:
@@ -35,8 +40,8 @@ class _Evidence:
         where: At which budget they were compared, in words.
     """
 
-    values: list[Value]
-    top: list[Value]
+    values: list[Drawn]
+    top: list[Drawn]
     where: str
 
     @property
@@ -44,13 +49,13 @@ class _Evidence:
         """How many of the best may use what is given up."""
         return int(SPARED_SHARE * len(self.top))
 
-    def is_unwanted(self, condition: Callable[[Value], bool]) -> bool:
+    def is_unwanted(self, condition: Callable[[Drawn], bool]) -> bool:
         """Whether the best hardly ever have such a value, though it was drawn often."""
         drawn, used = (sum(map(condition, values)) for values in (self.values, self.top))
         chance = hypergeom.cdf(used, len(self.values), drawn, len(self.top))
         return used <= self.spared and bool(chance <= SIGNIFICANCE)
 
-    def use_of(self, value: Value) -> str:
+    def use_of(self, value: Drawn) -> str:
         """How often a value was drawn, in words."""
         return f"{value!r} ({self.top.count(value)} of the best, {self.values.count(value)} of all)"
 
@@ -118,11 +123,12 @@ def _refined(
     evidence = _evidence(name, active, full_updates)
     if evidence is None:
         return parameter, f"kept: too few trials, {len(active)} of the {MIN_TRIALS} that it takes"
-    narrow = _narrow_choice if isinstance(parameter, Choice) else _narrow_range
-    return narrow(parameter, evidence)
+    if isinstance(parameter, Choice):
+        return _narrow_choice(parameter, evidence)
+    return _narrow_range(parameter, cast(_Evidence[float], evidence))  # a range holds numbers only
 
 
-def _evidence(name: str, records: Sequence[TrialRecord], full_updates: int) -> _Evidence | None:
+def _evidence(name: str, records: Sequence[TrialRecord], full_updates: int) -> _Evidence[Value] | None:
     """The best quarter of all at the largest budget that so many reached; None if there are too few trials."""
     values = [record.parameters[name] for record in records]
     trials = list(zip(map(_errors_by_updates, records), values, strict=True))
@@ -139,9 +145,11 @@ def _errors_by_updates(record: TrialRecord) -> Mapping[int, float]:
     return {entry["updates"]: entry["valid_error"] for entry in record.log if entry["valid_error"] is not None}
 
 
-def _narrow_choice(parameter: Choice, evidence: _Evidence) -> tuple[Choice, str]:
-    unwanted = [value for value in parameter.values if evidence.is_unwanted(lambda drawn, value=value: drawn == value)]
-    kept = [value for value in parameter.values if value not in unwanted or value in _held(parameter, evidence)]
+def _narrow_choice(parameter: Choice, evidence: _Evidence[Value]) -> tuple[Choice, str]:
+    unwanted = [value for value in parameter.values if evidence.is_unwanted(partial(eq, value))]
+    kept = [
+        value for value in parameter.values if value not in unwanted or value in _held(parameter.baseline, evidence)
+    ]
     listed = ", ".join(map(evidence.use_of, unwanted))
     if not unwanted:
         return parameter, f"kept: no clear preference among {evidence}"
@@ -150,11 +158,11 @@ def _narrow_choice(parameter: Choice, evidence: _Evidence) -> tuple[Choice, str]
     return parameter.model_copy(update={"values": kept}), f"narrowed to {kept}: {evidence} hardly use {listed}"
 
 
-def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence) -> tuple[IntRange | FloatRange, str]:
+def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence[float]) -> tuple[IntRange | FloatRange, str]:
     ordered = sorted(evidence.top)
     lowest, highest = ordered[evidence.spared], ordered[-1 - evidence.spared]
     low, high = _with_margin(parameter, lowest, highest)
-    held = _held(parameter, evidence)
+    held = _held(parameter.baseline, evidence)
     ends = (
         min(low, *held) if evidence.is_unwanted(lambda value: value < lowest) else parameter.range[0],
         max(high, *held) if evidence.is_unwanted(lambda value: value > highest) else parameter.range[1],
@@ -172,9 +180,9 @@ def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence) -> tupl
     )
 
 
-def _held(parameter: Parameter, evidence: _Evidence) -> tuple[Value, Value]:
+def _held(baseline: Drawn, evidence: _Evidence[Drawn]) -> tuple[Drawn, Drawn]:
     """Values that stay whatever the evidence says."""
-    return parameter.baseline, evidence.top[0]
+    return baseline, evidence.top[0]
 
 
 def _with_margin(parameter: IntRange | FloatRange, lowest: float, highest: float) -> tuple[float, float]:

@@ -36,12 +36,12 @@ def choose_finalists(
         count: Number of finalists.
         accurate_enough: Error below which cost alone matters; None for no such limit.
     """
-    distinct: dict[str, TrialRecord] = {}
+    distinct: dict[str, tuple[TrialRecord, float]] = {}
     for record in records:
-        if record.outcome == "completed" and record.last is not None:
-            distinct.setdefault(identity(record.parameters), record)
-    by_id = {record.id: record for record in distinct.values()}
-    errors = {trial: record.last["valid_error"] for trial, record in by_id.items()}
+        if (error := record.final_error) is not None:
+            distinct.setdefault(identity(record.parameters), (record, error))
+    by_id = {record.id: record for record, _ in distinct.values()}
+    errors = {record.id: error for record, error in distinct.values()}
     front = pareto_front({trial: (errors[trial], cost[trial]) for trial in by_id})[::-1]
     enough = [trial for trial in front if accurate_enough is not None and errors[trial] <= accurate_enough]
     if len(enough) > count:
@@ -220,16 +220,26 @@ def _comparisons(
     comparisons = []
     for name in sorted(errors, key=lambda name: (times[name].ms, float(np.mean(errors[name])))):
         error, to_best = float(np.mean(errors[name])), paired_ratio(errors[name], errors[best])
-        good = {
-            "within_one_se": to_best.log_ratio <= min(to_best.log_standard_error, own_se),
-            "non_inferior": name == best or (to_best.ci95 is not None and to_best.ci95[1] <= 1 + margin),
-            "accurate_enough": accurate_enough is not None and error <= accurate_enough,
-        }
+        within_one_se = to_best.log_ratio <= min(to_best.log_standard_error, own_se)
+        non_inferior = name == best or (to_best.ci95 is not None and to_best.ci95[1] <= 1 + margin)
+        enough = accurate_enough is not None and error <= accurate_enough
         failed = tuple(failures.get(name, ()))
-        unstable = bool(failed) and not none_stable
-        why_not = f"failed {_shortly(failed)}" if unstable else "" if any(good.values()) else "less accurate"
-        facts = {"failures": failed, "eligible": not why_not, "why_not": why_not}
-        comparisons.append(Comparison(id=name, error=error, time=times[name], to_best=to_best, **good, **facts))
+        less_accurate = "" if within_one_se or non_inferior or enough else "less accurate"
+        why_not = f"failed {_shortly(failed)}" if failed and not none_stable else less_accurate
+        comparisons.append(
+            Comparison(
+                id=name,
+                error=error,
+                time=times[name],
+                to_best=to_best,
+                within_one_se=within_one_se,
+                non_inferior=non_inferior,
+                accurate_enough=enough,
+                failures=failed,
+                eligible=not why_not,
+                why_not=why_not,
+            )
+        )
     return tuple(comparisons)
 
 

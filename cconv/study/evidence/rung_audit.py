@@ -44,10 +44,11 @@ def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: fl
     at_rung, at_full = _errors_at_both(records, updates)
     trials = len(at_rung)
     counts = {"top": min(trials, max(3, math.ceil(top * trials))), "kept": max(1, math.ceil(kept * trials))}
-    measures = dict.fromkeys(MEASURES)
+    measures: dict[str, float | None] = dict.fromkeys(MEASURES)
     if trials >= FEWEST_TRIALS:
         measures = rung_measures(at_rung, at_full, **counts)
-    interval = None if measures["spearman"] is None else spearman_interval(measures["spearman"], trials)
+    correlation, survival = measures["spearman"], measures["survival"]
+    interval = None if correlation is None else spearman_interval(correlation, trials)
     return RungAudit(
         updates=updates,
         trials=trials,
@@ -55,7 +56,7 @@ def _audit(records: Sequence[TrialRecord], updates: int, *, top: float, kept: fl
         **measures,
         spearman_ci95=interval,
         why_no_interval="" if interval else _why_no_interval(trials),
-        verdict="undecided" if interval is None else _verdict(measures, interval),
+        verdict=_verdict(correlation, survival, interval),
     )
 
 
@@ -81,9 +82,8 @@ def spearman_interval(correlation: float, trials: int) -> list[float] | None:
 
 
 def _errors_at_both(records: Sequence[TrialRecord], updates: int) -> tuple[np.ndarray, np.ndarray]:
-    completed = [record for record in records if record.outcome == "completed" and record.last]
-    pairs = [(record.error_at(updates), record.last["valid_error"]) for record in completed]
-    at_rung, at_full = np.array([pair for pair in pairs if pair[0] is not None]).reshape(-1, 2).T
+    pairs = [(record.error_at(updates), record.final_error) for record in records]
+    at_rung, at_full = np.array([pair for pair in pairs if None not in pair]).reshape(-1, 2).T
     return at_rung, at_full
 
 
@@ -122,7 +122,9 @@ def _crossing_rate(at_rung: np.ndarray, at_full: np.ndarray) -> float | None:
     return float(np.count_nonzero(turns < 0) / ordered) if ordered else None
 
 
-def _verdict(measures: dict[str, float | None], interval: Sequence[float]) -> str:
-    if measures["spearman"] < RELIABLE_CORRELATION or measures["survival"] < RELIABLE_SURVIVAL:
+def _verdict(correlation: float | None, survival: float | None, interval: Sequence[float] | None) -> str:
+    if correlation is None or survival is None or interval is None:
+        return "undecided"
+    if correlation < RELIABLE_CORRELATION or survival < RELIABLE_SURVIVAL:
         return "unreliable"
     return "reliable" if interval[0] >= RELIABLE_CORRELATION else "undecided"

@@ -42,8 +42,8 @@ def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
     spent, best = 0, float("inf")
     for record in records:
         spent += record.log[-1]["updates"] if record.log else 0
-        if record.outcome == "completed" and record.last is not None:
-            best = min(best, record.last["valid_error"])
+        if (error := record.final_error) is not None:
+            best = min(best, error)
         if best < float("inf"):
             curve.append((spent, best))
     return curve

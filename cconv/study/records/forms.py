@@ -1,7 +1,7 @@
 """What the JSON files of a run folder may hold: a file that does not fit is refused in one line."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, Field, RootModel
 
@@ -9,8 +9,8 @@ from cconv.errors import DataError
 from cconv.files import read_json
 from cconv.validation import Flag, Model, Name, OpenModel, Real, Value, Whole, validated
 
-OUTCOMES = ("completed", "stopped", "failed", "diverged", "interrupted")
-
+OutcomeName = Literal["completed", "stopped", "failed", "diverged", "interrupted"]
+OUTCOMES: tuple[str, ...] = get_args(OutcomeName)
 
 Count = Annotated[Whole, Field(ge=0, lt=2**63)]
 NonNegative = Annotated[Real, Field(ge=0)]
@@ -41,7 +41,7 @@ class TrainingDescription(OpenModel):
 class Outcome(OpenModel):
     """outcome.json of a training."""
 
-    outcome: Literal[OUTCOMES]
+    outcome: OutcomeName
     reason: str
 
 
@@ -116,7 +116,7 @@ class Table(RootModel):
     root: dict
 
 
-FORMS = {
+FORMS: dict[str, type[BaseModel]] = {
     "study.json": _Study,
     "environment.json": _Environment,
     "state.json": _State,
@@ -133,7 +133,7 @@ def read_typed(path: Path, form: type[Model]) -> Model:
     return validated(form, read_json(path), path, DataError)
 
 
-def read_record(path: Path, form: type[BaseModel] = Table):
+def read_record(path: Path, form: type[BaseModel] = Table) -> dict[str, Any]:
     """Content of a JSON file that fits a form, as it stands there.
 
     Raises:

@@ -4,7 +4,7 @@ Errors are those of the objective that the task names. A field that ends in ``ci
 there is too little for one.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from cconv.study.records.forms import Count, NonNegative
 from cconv.validation import Flag, Id, Name, Real, StrictModel, Value
@@ -86,6 +86,14 @@ class ReplayedStrategy(StrictModel):
     regret_range95: Interval
 
 
+class TestedShare(NamedTuple):
+    """A share of the variance, and the ends of its 95 % interval."""
+
+    share: float
+    low: float
+    high: float
+
+
 class ParameterImportance(StrictModel):
     """How much a hyperparameter decides; the tested values are None where the trials do not vary it.
 
@@ -106,6 +114,13 @@ class ParameterImportance(StrictModel):
     decided: Flag
     f_anova: Real
     ped_anova: Real
+
+    @property
+    def tested(self) -> TestedShare | None:
+        """The share with its interval; None where the trials do not vary the hyperparameter."""
+        if self.share is None or self.low is None or self.high is None:
+            return None
+        return TestedShare(self.share, self.low, self.high)
 
 
 class RungImportance(StrictModel):

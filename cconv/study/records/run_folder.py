@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import Timeout
 
@@ -195,11 +196,11 @@ class RunFolder:
                 records[checked_id(finalist.name)] = read
         return records
 
-    def write(self, name: str, value) -> None:
+    def write(self, name: str, value: object) -> None:
         """Write a JSON file of the run folder."""
         write_json(self.path / name, value)
 
-    def read(self, name: str):
+    def read(self, name: str) -> dict[str, Any]:
         """Read a JSON file of the run folder.
 
         Raises:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from cconv.errors import ConfigError, DataError
 from cconv.files import parse_json, read_text, write_json, write_text
@@ -60,6 +61,16 @@ class TrialRecord:
         """The last evaluation with a finite error, or None."""
         finite = [entry for entry in self.log if entry["valid_error"] is not None]
         return finite[-1] if finite else None
+
+    @property
+    def last_error(self) -> float | None:
+        """Validation error of the last evaluation with a finite one, or None."""
+        return self.last["valid_error"] if self.last else None
+
+    @property
+    def final_error(self) -> float | None:
+        """The last validation error of a training of the full budget; None for any other."""
+        return self.last_error if self.outcome == "completed" else None
 
 
 class TrialFolder:
@@ -138,7 +149,8 @@ class TrialFolder:
         Raises:
             DataError: If a file is damaged.
         """
-        config = dict.fromkeys(KNOWN_BEFORE) | read_record(self.path / "config.json", TrainingDescription)
+        config: dict[str, Any] = dict.fromkeys(KNOWN_BEFORE)
+        config |= read_record(self.path / "config.json", TrainingDescription)
         end = {"outcome": "interrupted", "reason": ""}
         if self.ended:
             end = read_record(self.path / "outcome.json", Outcome)

@@ -46,7 +46,7 @@ class Attempt:
         faulthandler.dump_traceback_later(self._seconds, exit=True, file=self._file)
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
         faulthandler.cancel_dump_traceback_later()
         self._file.close()
         if self.holds:

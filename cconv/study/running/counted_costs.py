@@ -72,13 +72,13 @@ def points_of_search(
     )
     particles = next(iter(known.values())).num_particles
 
-    def point(record: TrialRecord) -> SearchPoint:
+    def point(record: TrialRecord, error: float) -> SearchPoint:
         measurement = known.get(record.id)
         predicted = 1e-3 * particles * check.time_model.predict(count(record.parameters))
         return SearchPoint(
             id=record.id,
             stage=record.stage,
-            valid_error=record.last["valid_error"],
+            valid_error=error,
             ms_per_frame=predicted if measurement is None else measurement.ms_per_frame,
             measured=measurement is not None,
             num_parameters=record.config["num_parameters"],
@@ -86,5 +86,5 @@ def points_of_search(
             parameters=record.parameters,
         )
 
-    points = [point(record) for record in records if record.last is not None]
+    points = [point(record, error) for record in records if (error := record.last_error) is not None]
     return points, CostModel.model_validate(asdict(check))

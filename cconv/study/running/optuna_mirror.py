@@ -14,7 +14,7 @@ import optuna
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import Trial, TrialState, create_trial
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from sqlalchemy.exc import SQLAlchemyError
 
 from cconv.errors import ConfigError
@@ -217,5 +217,5 @@ class OptunaMirror:
         else:
             self._study.tell(frozen.number, state=TrialState.PRUNED if values else TrialState.FAIL)
 
-    def _frozen(self, trial: str):
+    def _frozen(self, trial: str) -> FrozenTrial:
         return self._study.get_trials(deepcopy=False)[self._numbers[trial]]

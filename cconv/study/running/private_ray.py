@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 from ray._private import ray_constants
-from ray._raylet import AuthenticationTokenLoader, Config
+from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]  # compiled, without stubs
 from ray.exceptions import AuthenticationError
 
 from cconv.errors import ConfigError
@@ -61,7 +61,7 @@ def asking_once() -> AbstractContextManager[None]:
 
 
 @contextmanager
-def _constant_of_ray(name: str, value) -> Iterator[None]:
+def _constant_of_ray(name: str, value: int) -> Iterator[None]:
     before = getattr(ray_constants, name)
     setattr(ray_constants, name, value)
     try:

@@ -154,7 +154,7 @@ def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None
     of_card = _with(own, {"path": path or own.path} | said)
     if path is None or _same_folder(path, own.path):
         return open_study_data(of_card, seed), True
-    other = open_study_data(_with(own, dict.fromkeys(OVERRIDES) | {"path": path} | said), seed)
+    other = open_study_data(_with(own, {**dict.fromkeys(OVERRIDES), "path": path, **said}), seed)
     if "data_sha256" in card and other.fingerprint() == card["data_sha256"]:
         return open_study_data(of_card, seed), True
     for name in ("mass", "particle_spacing"):
@@ -163,7 +163,7 @@ def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None
 
 
 def _with(data: DataConfig, changes: Mapping) -> DataConfig:
-    return validated(DataConfig, data.model_dump() | changes, "data")
+    return validated(DataConfig, {**data.model_dump(), **changes}, "data")
 
 
 def _same_folder(path: str, other: str | None) -> bool:

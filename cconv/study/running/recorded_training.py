@@ -1,6 +1,6 @@
 """One job of a queue trained in this process, whatever happens to it: what every pool does with each."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import NamedTuple
 
 from cconv.errors import ConfigError, is_disk_full
@@ -34,13 +34,13 @@ class Report(NamedTuple):
 
 def train_recorded(
     job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem
-) -> Iterator[Report]:
+) -> Generator[Report, None, None]:
     """Train a job; reports every evaluation, then how it ended if the training itself knows.
 
     An error of the training is an outcome of the job, not an exception. A training that hangs ends this process.
     """
     limit = _seconds_limit(study, training)
-    last = {"updates": 0, "valid_error": None, "diverged": False, "seconds": 0.0}
+    last: dict = {"updates": 0, "valid_error": None, "diverged": False, "seconds": 0.0}
     outcome, reason = None, ""
     try:
         with Attempt(job.folder, HANGING * limit) as attempt:

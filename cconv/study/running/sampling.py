@@ -4,12 +4,12 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from cconv.errors import ConfigError
-from cconv.study.declared.domains import Choice, Parameter, SearchSpace, Value
+from cconv.study.declared.domains import Choice, IntRange, Parameter, SearchSpace, Value
 from cconv.study.records.trials import TrialRecord
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class _Scalarization:
     def of(
         cls, records: Sequence[TrialRecord], costs: Mapping[str, float], error_weight: float, useless_error: float
     ) -> "_Scalarization":
-        known = [record.last["valid_error"] for record in records if record.last is not None]
+        known = [error for record in records if (error := record.last_error) is not None]
         of_errors = _log_span([min(error, useless_error) for error in known])
         return cls(of_errors, _log_span([costs[record.id] for record in records]), error_weight, useless_error)
 
@@ -175,8 +175,10 @@ def _distribution(parameter: Parameter) -> "BaseDistribution":
 
     if isinstance(parameter, Choice):
         return CategoricalDistribution(parameter.values)
-    kind = {"int": IntDistribution, "float": FloatDistribution}[parameter.type]
-    return kind(*parameter.range, log=parameter.scale == "log")
+    log = parameter.scale == "log"
+    if isinstance(parameter, IntRange):
+        return IntDistribution(*parameter.range, log=log)
+    return FloatDistribution(*parameter.range, log=log)
 
 
 def _study_in_memory(seed: int) -> "Study":
@@ -239,6 +241,6 @@ def _proposals(study: "Study", space: SearchSpace) -> Iterator[dict[str, Value]]
 
 def _suggest(trial: "Trial", name: str, parameter: Parameter) -> Value:
     if isinstance(parameter, Choice):
-        return trial.suggest_categorical(name, parameter.values)
+        return cast(Value, trial.suggest_categorical(name, parameter.values))  # one of them, and none is None
     suggest = trial.suggest_int if parameter.type == "int" else trial.suggest_float
     return suggest(name, *parameter.range, log=parameter.scale == "log")

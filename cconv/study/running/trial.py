@@ -82,8 +82,9 @@ def run_trial(
                     return
                 continue
             entry = _entry(state)
-            if not state.diverged and state.valid_error < best:
-                best = state.valid_error
+            error = entry["valid_error"]
+            if error is not None and error < best:
+                best = error
                 save_model(model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
             folder.append(entry)
             save_progress(folder.progress, model, progress)

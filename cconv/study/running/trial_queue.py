@@ -1,9 +1,10 @@
 """The trainings of a stage, one after another: handed out, judged at the rungs, ended. Knows nothing of Ray."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from cconv.study.records.rungs import RungFile, RungTable
 from cconv.study.records.trials import TrialFolder
@@ -35,6 +36,13 @@ def job_in(folder: TrialFolder, name: str, parameters: Mapping, init_seed: int) 
     """
     folder.check_begun_with(parameters)
     return Job(folder=folder.path.absolute(), name=name, parameters=dict(parameters), init_seed=init_seed)
+
+
+class Judge(Protocol):
+    """Decides after every evaluation whether a training goes on."""
+
+    def goes_on(self, name: str, entry: Mapping) -> bool:
+        """Whether a training goes on after an evaluation."""
 
 
 class NothingStops:
@@ -82,7 +90,7 @@ class TrialQueue:
         observers: See the trainings as they run.
     """
 
-    def __init__(self, jobs: Iterable[Job], full_updates: int, judge, observers: Sequence[Observer]):
+    def __init__(self, jobs: Iterable[Job], full_updates: int, judge: Judge, observers: Sequence[Observer]):
         self._jobs = iter(jobs)
         self.full_updates = full_updates
         self._judge, self._observers = judge, observers
@@ -95,20 +103,23 @@ class TrialQueue:
             if folder.ended:
                 continue
             self._running[job.name] = job
-            self._tell(lambda observer, job=job: observer.on_trial_start(job.name, job.parameters))
+            for observer in self._observers:
+                observer.on_trial_start(job.name, job.parameters)
             if self._goes_on_from(folder, job.name):
                 return job
         return None
 
     def on_result(self, name: str, entry: Mapping) -> bool:
         """Take an evaluation; whether the training goes on."""
-        self._tell(lambda observer: observer.on_trial_result(name, entry))
+        for observer in self._observers:
+            observer.on_trial_result(name, entry)
         return self._judge.goes_on(name, entry)
 
     def on_end(self, name: str, outcome: str, reason: str = "") -> None:
         """Record how a training ended."""
         TrialFolder(self._running.pop(name).folder).finish(outcome, reason)
-        self._tell(lambda observer: observer.on_trial_end(name, outcome, reason))
+        for observer in self._observers:
+            observer.on_trial_end(name, outcome, reason)
 
     def outcome_after(self, entry: Mapping) -> str:
         """How a training ends that does not go on after an evaluation."""
@@ -122,7 +133,3 @@ class TrialQueue:
                 self.on_end(name, self.outcome_after(entry))
                 return False
         return True
-
-    def _tell(self, say: Callable[[Observer], None]) -> None:
-        for observer in self._observers:
-            say(observer)

@@ -110,10 +110,10 @@ def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range
         choices = [{name: value} for value in values]
         drawn = _extended(drawn, [choices if space.is_active(name, layer) else [{}] for layer in drawn])
     layers: dict[str, dict] = {}
-    for values in drawn:
-        architecture = values.get(ARCHITECTURE, network.architecture)
+    for assignment in drawn:
+        architecture = assignment.get(ARCHITECTURE, network.architecture)
         if settings := linear.get(architecture):
-            of_it = {path: value for path, value in values.items() if path in _applies(settings)}
+            of_it = {path: value for path, value in assignment.items() if path in _applies(settings)}
             layer = {**_paths(settings.linear_with), ARCHITECTURE: architecture, **of_it}
             layers.setdefault(identity(layer), layer)
     return list(layers.values())
@@ -132,7 +132,7 @@ def _applies(settings: type[NetworkSettings]) -> set[str]:
 def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
     """Each layer with each of its choices, in order; `MOST_LAYERS` of them, drawn at random, where there are more."""
     ends = list(accumulate(map(len, choices)))
-    places = range(ends[-1])
+    places: Sequence[int] = range(ends[-1])
     if len(places) > MOST_LAYERS:
         places = sorted(random.Random(0).sample(places, MOST_LAYERS))
     owners = ((place, bisect_right(ends, place)) for place in places)
@@ -153,7 +153,7 @@ def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]])
 
 def _same_but_basis_size(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
     """Whether a layer differs from that of a record in the number of its basis functions alone."""
-    path = f"{NETWORK}.{ARCHITECTURES[layer[ARCHITECTURE]].basis_size}"
+    path = f"{NETWORK}.{ARCHITECTURES[str(layer[ARCHITECTURE])].basis_size}"
     return path in layer and record.parameters | {path: layer[path]} == layer
 
 
@@ -175,7 +175,8 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
     Returns:
         Hyperparameters of the finalists, by id; that of one that lost a feature says so.
     """
-    study, chosen = session.study, {}
+    study = session.study
+    chosen: dict[str, tuple[str, dict[str, Value]]] = {}
     for name in reads_of(study.stages, stage):
         settings = study.stages[name]
         if isinstance(settings, ClosedFormStage):
@@ -205,7 +206,7 @@ def without_unneeded_features(
     error = fitted(finalist, parameters)
     for feature in OPTIONAL_FEATURES:
         path = feature_path(feature)
-        if parameters.get(path) and False in session.space.parameters[path].values:
+        if parameters.get(path) and session.space.parameters[path].holds(False):
             leaner, fewer = f"{finalist}_no_{feature}", parameters | {path: False}
             error_without = fitted(leaner, fewer)
             if error_without <= error * (1 + session.study.selection.margin):
@@ -249,20 +250,20 @@ def _fit_and_record(
     except ConfigError as error:
         folder.finish("failed", str(error))
         return
-    error = problem.objective.error(model, valid)
-    if not math.isfinite(error):
+    valid_error = problem.objective.error(model, valid)
+    if not math.isfinite(valid_error):
         folder.finish("failed", "its predictions are not finite")
         return
     entry = {
         "updates": 0,
         "train_loss": None,
-        "valid_error": error,
+        "valid_error": valid_error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
         "diverged": False,
     }
     folder.append(entry)
-    card = config | dict(trial.provenance) | {"valid_error": entry["valid_error"], "updates": 0}
+    card = config | dict(trial.provenance) | {"valid_error": valid_error, "updates": 0}
     save_model(model.eval(), folder.checkpoint, card)
     folder.finish("completed")
 
@@ -270,7 +271,7 @@ def _fit_and_record(
 def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[str, Value]]:
     """At most `count` layers, as many of each architecture as there are, drawn at random where there are more."""
     drawn = [layers[index] for index in np.random.default_rng(seed).permutation(len(layers))]
-    rank = Counter()
+    rank: Counter[Value] = Counter()
     ranked = []
     for layer in drawn:
         rank[layer[ARCHITECTURE]] += 1

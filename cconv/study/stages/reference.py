@@ -85,7 +85,7 @@ def _by_first_rung(finals: Sequence[TrialRecord], num_trials: int, rungs: Sequen
     spent, best, curve = num_trials * rungs[0], math.inf, []
     for record in finals:
         spent += rungs[-1] - rungs[0]
-        if record.outcome == "completed" and record.last:
-            best = min(best, record.last["valid_error"])
+        if (error := record.final_error) is not None:
+            best = min(best, error)
             curve.append((spent, best))
     return SearchStrategy(updates=spent, best_valid=best if curve else None, curve=curve)

@@ -5,6 +5,7 @@ from summaries import SAMPLE, whole_summary
 
 from cconv.errors import ConfigError, DataError
 from cconv.files import read_json, write_json
+from cconv.study.records.forms import OUTCOMES
 from cconv.study.records.found import Found, StageResult
 from cconv.study.records.run_folder import FORMAT, RunFolder
 
@@ -60,6 +61,16 @@ def test_a_diverged_last_entry_is_no_error(tmp_path):
     trial.append(ENTRY)
     trial.append(ENTRY | {"updates": 10, "valid_error": None})
     assert trial.read().last["updates"] == 5
+    assert trial.read().last_error == ENTRY["valid_error"]
+
+
+@pytest.mark.parametrize("outcome", OUTCOMES)
+def test_only_a_completed_training_has_a_final_error(outcome, tmp_path):
+    trial = RunFolder(tmp_path).trial("random_0000")
+    trial.start(CONFIG)
+    trial.append(ENTRY)
+    trial.finish(outcome)
+    assert trial.read().final_error == (ENTRY["valid_error"] if outcome == "completed" else None)
 
 
 def test_writing_leaves_no_temporary_file(tmp_path):
