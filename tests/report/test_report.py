@@ -106,8 +106,8 @@ def test_the_answer_says_where_analytic_sph_is_cheaper_and_exact(other_run, ms, 
 
 def test_analytic_sph_and_the_densitys_symbols_are_not_spoken_of_where_the_task_has_none(run, no_charts):
     summary = run.summary()
-    task = changed(summary.task, name="next_frame", symbol="x", meaning="The next frame.", error="mean squared shift")
-    task = changed(task, error_meaning="How far particles are off.", measures={})
+    words_of_task = {"symbol": "x", "meaning": "The next frame.", "error": "mean squared shift", "error_meaning": ""}
+    task = changed(summary.task, name="next_frame", measures={}, **words_of_task)
     run.write_summary(changed(summary, task=task))
     text = words(render_report(run))
     assert "has a mean squared shift of" in text

@@ -1,6 +1,7 @@
 """The sections of the report, one file each, in the order of the page.
 
-A new one is a subclass of `Section` in a file of its own, a template of its name, and a line in this list.
+To add a section, write a subclass of `Section` in a file of its own and a template of its name, and add a line to this
+list.
 """
 
 from cconv.report.sections.ablation import AblationSection

@@ -1,4 +1,4 @@
-"""What each change between the baseline and the best model brings."""
+"""The section on ablation: what each change between the baseline and the best model brings."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ from cconv.study.records.summary import Summary
 
 
 class AblationSection(Section):
-    """Models trained anew with one change after the other, and with one part more or less."""
+    """Show the models retrained with one change after the other, and with one feature removed or added."""
 
     name = "ablation"
-    title = "What each part brings"
+    title = "Ablation"
     part = "ablation"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The errors along the path, if there is one."""
+        """Draw the errors along the path, if there is one."""
         has_path = summary.ablation is not None and summary.ablation.path
         return {"chart": ablation_chart(summary) if has_path else None}

@@ -1,4 +1,4 @@
-"""The answer: the recommended model, what it does, and the baseline and the analytic field beside it."""
+"""The answer: the recommended model and its figures, compared with the baseline and the analytic field."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ from cconv.study.records.summary import FinalistEntry, Summary
 
 
 class AnswerSection(Section):
-    """The recommended model, the reason, and its figures."""
+    """Show the recommended model, the reason, and its figures."""
 
     name = "answer"
     title = "Answer"
     part = "recommended"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The reason in two parts, the recommended model, and the baseline as ratios if it is another model."""
+        """Return the reason in two parts, and the baseline as ratios to the recommended model if they differ."""
         baseline = summary.finalist(summary.baseline)
         is_other = baseline is not None and baseline is not summary.chosen
         return {
@@ -25,7 +25,7 @@ class AnswerSection(Section):
 
 
 def _lead(text: str) -> tuple[str, str]:
-    """The first sentence and the others."""
+    """Split a text into its first sentence and the others."""
     first, stop, others = text.partition(". ")
     return first + stop.strip(), others
 

@@ -1,4 +1,4 @@
-"""What the budget of the trainings decided."""
+"""The section on the training budget: whether the errors still fell when it was used up."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from cconv.study.records.summary import Summary
 
 
 class BudgetSection(Section):
-    """Errors of the finalists against updates and seconds, and what larger budgets brought."""
+    """Show the errors of the finalists against updates and seconds, and with larger budgets."""
 
     name = "budget"
-    title = "What the budget decided"
+    title = "Was the training budget large enough?"
     part = "finalists"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The curves of the finalists."""
+        """Draw the learning curves of the finalists."""
         return {"chart": budget_chart(records.curves, summary)}

@@ -1,4 +1,4 @@
-"""The chart of the study: error against time per frame, to hover over."""
+"""The interactive chart of error against time per frame."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from cconv.study.records.summary import Summary
 
 
 class ChartSection(Section):
-    """Error against time per frame of finalists and search."""
+    """Show the error against the time per frame of the finalists and the trials."""
 
     name = "chart"
     title = "Speed and accuracy"
     part = "finalists"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The interactive chart as HTML."""
+        """Draw the interactive chart as HTML."""
         return {"chart": interactive_html(summary)}

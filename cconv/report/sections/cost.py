@@ -1,4 +1,4 @@
-"""What predictions and trainings cost."""
+"""The section on the cost of predictions and trainings."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ from cconv.study.records.summary import Summary
 
 
 class CostSection(Section):
-    """Times of the finalists, where they go, and how they grow with the scene."""
+    """Show the times of the finalists by part, and how they grow with the scene."""
 
     name = "cost"
     title = "Cost"
     part = "finalists"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The finalists, fastest first, and the growth of their times."""
+        """List the finalists, fastest first, and draw the growth of their times."""
         rows = [row for row in finalists_rows(summary) if row["entry"]]
         return {"rows": sorted(rows, key=lambda row: row["ms_per_frame"]), "growth": growth_chart(summary)}

@@ -8,13 +8,13 @@ from cconv.study.records.summary import Summary
 
 
 class FinalistsSection(Section):
-    """Errors, times and sizes of the finalists, and their hyperparameters."""
+    """Show errors, times, sizes and hyperparameters of the finalists."""
 
     name = "finalists"
     title = "Finalists"
     part = "finalists"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """A row a model, the mean predictor and the analytic field among them."""
+        """Return a row for each model, the mean predictor and the analytic field included."""
         reasons = dict.fromkeys(entry.test.why_no_interval for entry in summary.finalists)
         return {"rows": finalists_rows(summary), "why_no_interval": [reason for reason in reasons if reason]}

@@ -1,10 +1,10 @@
-"""The words of the report."""
+"""The glossary of the report."""
 
 from cconv.report.sections.section import LastingSection
 
 
 class GlossarySection(LastingSection):
-    """What the words of the report mean."""
+    """Explain the technical words of the report."""
 
     name = "glossary"
     title = "Glossary"

@@ -1,4 +1,4 @@
-"""What decides the error: how much each hyperparameter does, and how."""
+"""The section on importance: how much each hyperparameter influences the error, and in which way."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from cconv.study.records.summary import Summary
 
 
 class ImportanceSection(Section):
-    """Importance of the hyperparameters by rung, and the error against the strongest of them."""
+    """Show the importance of the hyperparameters by rung, and the error against the strongest of them."""
 
     name = "importance"
-    title = "What decides the error"
+    title = "Importance of the hyperparameters"
     part = "importance"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """What the trials can tell; and the charts, where they tell something."""
+        """Return what the trials can detect in sentences, and the charts if there is any importance."""
         importance, dependences = summary.importance, summary.partial_dependence
         is_known = any(entry.parameters for entry in importance)
         return {

@@ -1,4 +1,4 @@
-"""What the recommended model and the baseline have learned: filters, a predicted frame, errors of particles."""
+"""The section on what the recommended model and the baseline learned: filters, a predicted frame, particle errors."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ from cconv.study.records.summary import Summary
 
 
 class LearnedSection(Section):
-    """Filters beside those of analytic SPH, the predicted field beside the true one, and how errors are spread."""
+    """Show filters beside those of analytic SPH, a predicted beside the true field, and the spread of the errors."""
 
     name = "learned"
-    title = "What was learned"
+    title = "What the models learned"
     part = "explained"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """Charts of each explained model, the recommended one first."""
+        """Draw the charts of each explained model, the recommended one first."""
         explanations = read_explanations(records.run, summary.explained)
         best = summary.recommended.id
         names = sorted(explanations, key=lambda name: name != best)

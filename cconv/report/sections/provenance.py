@@ -1,10 +1,10 @@
-"""Where the study comes from: commit, data, seeds, versions."""
+"""The provenance of a study: commit, data, seeds, versions."""
 
 from cconv.report.sections.section import LastingSection
 
 
 class ProvenanceSection(LastingSection):
-    """Commit, data, seeds and versions of the study."""
+    """Show commit, data, seeds and versions of the study."""
 
     name = "provenance"
     title = "Provenance"

@@ -1,10 +1,10 @@
-"""How the search space was narrowed."""
+"""The section on the narrowed search space."""
 
 from cconv.report.sections.section import Section
 
 
 class RefinedSection(Section):
-    """What a narrowed space draws each hyperparameter from, and why."""
+    """Show the domain of each hyperparameter in the narrowed space, and the evidence for it."""
 
     name = "refined"
     title = "How the space was narrowed"

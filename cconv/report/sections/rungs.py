@@ -1,4 +1,4 @@
-"""Whether a trial may be stopped at a rung."""
+"""The audit of the rungs: whether early stopping drops good trials there."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from cconv.study.records.summary import Summary
 
 
 class RungsSection(Section):
-    """How well the order of the trials at a rung predicts the order at the end."""
+    """Show how well the order of the trials at a rung predicts their order after the full budget."""
 
     name = "rungs"
-    title = "May a trial be stopped at a rung?"
+    title = "Does early stopping drop good trials?"
     part = "rung_audit"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The measures of the audit by rung."""
+        """Draw the measures of the audit by rung."""
         return {"chart": rung_audit_chart(summary)}

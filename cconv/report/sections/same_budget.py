@@ -1,4 +1,4 @@
-"""ASHA beside another rule for stopping trials, at the same budget."""
+"""The section that compares ASHA with another stopping rule at the same budget."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from cconv.study.records.summary import Summary
 
 
 class SameBudgetSection(Section):
-    """What each rule for stopping trials found with the same number of gradient updates."""
+    """Show what each stopping rule found with the same number of gradient updates."""
 
     name = "same_budget"
-    title = "The same budget, spent by another rule"
+    title = "Another stopping rule with the same budget"
     part = "references"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The best error of each rule against the updates spent."""
+        """Draw the best error of each rule against the updates spent."""
         return {"chart": strategies_chart(summary)}

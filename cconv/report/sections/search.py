@@ -1,4 +1,4 @@
-"""What the search did: its trials, what was stopped, and their errors."""
+"""The section on the search: its trials, their outcomes and their errors."""
 
 from typing import Any
 
@@ -11,13 +11,13 @@ from cconv.study.records.summary import Summary
 
 
 class SearchSection(LastingSection):
-    """Trials of the search by stage and outcome, learning curves, and a table of all."""
+    """Show the trials by stage and outcome, their learning curves, and a table of all."""
 
     name = "search"
     title = "What the search did"
 
     def draw(self, summary: Summary | None, records: Records) -> dict[str, Any]:
-        """Charts of the trials, if any was evaluated, and the trials by error."""
+        """Draw the trials, if any was evaluated, and list them by error."""
         charts = {}
         if records.has_errors:
             charts = {
@@ -29,7 +29,7 @@ class SearchSection(LastingSection):
 
 
 def _by_error(trials: pd.DataFrame, summary: Summary | None) -> pd.DataFrame:
-    """Trials by error, with a row of the mean predictor in its place, where it is known."""
+    """Sort the trials by error, with a row for the mean predictor if its error is known."""
     table = trials.astype(object)  # a row with gaps would turn whole numbers into fractions
     if summary is not None:
         table.loc[len(table), ["trial", "valid_error"]] = [MEAN_PREDICTOR, summary.mean_predictor.valid]

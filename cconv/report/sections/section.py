@@ -1,4 +1,4 @@
-"""What a section of the report is: where it applies, and what its template shows."""
+"""The base classes of the sections of the report, and the records that they show."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,13 +12,13 @@ from cconv.study.records.summary import Summary
 
 @dataclass(frozen=True, kw_only=True)
 class Records:
-    """What a run folder holds beside the summary, read once for all sections.
+    """The records of a run folder beside the summary, read once for all sections.
 
     Attributes:
         run: The folder.
         study: Its study file.
         space: Its search space.
-        environment: Versions, seeds and data; None where the run ended before its data were read.
+        environment: Versions, seeds and data; None if the run ended before its data were read.
         trials: `trials_table` of the run.
         curves: `curves_table` of the run.
     """
@@ -45,7 +45,7 @@ class Records:
 
     @property
     def has_errors(self) -> bool:
-        """Whether a trial of a search was evaluated."""
+        """True if a trial of a search was evaluated."""
         return not self.trials.empty and bool(self.trials["valid_error"].notna().any())
 
 
@@ -55,7 +55,7 @@ class Section:
     Attributes:
         name: Its anchor, and the name of its template in ``templates/sections/``.
         title: Its heading.
-        part: The part of the summary that it shows: it applies where the summary holds it.
+        part: The part of the summary that it shows; the section is left out if the summary lacks it.
     """
 
     name: ClassVar[str]
@@ -63,21 +63,21 @@ class Section:
     part: ClassVar[str]
 
     def applies(self, summary: Summary | None) -> bool:
-        """Whether a run holds what the section shows; `summary` is None where the study has not finished."""
+        """Tell whether a run has the data of the section; `summary` is None if the study has not finished."""
         return bool(getattr(summary, self.part, None))
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """What the template shows beside the summary and the records, such as figures and rows; nothing by default."""
+        """Return what the template shows beside summary and records, such as figures and rows; by default nothing."""
         return {}
 
 
 class LastingSection(Section):
-    """A section of every run, finished or not."""
+    """A section that every run has, finished or not."""
 
     def applies(self, summary: Summary | None) -> bool:
-        """Whether it stands in the page: always."""
+        """Return True: the section is in every report."""
         return True
 
     def draw(self, summary: Summary | None, records: Records) -> dict[str, Any]:
-        """What the template shows beside them; `summary` is None where the study has not finished."""
+        """Return what the template shows; `summary` is None if the study has not finished."""
         return {}

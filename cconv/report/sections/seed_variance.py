@@ -1,11 +1,11 @@
-"""The luck of initial weights."""
+"""The section on the seed variance."""
 
 from cconv.report.sections.section import Section
 
 
 class SeedVarianceSection(Section):
-    """Spread of the error over initial weights beside that over configurations."""
+    """Show the spread of the error over initial weights beside the spread over configurations."""
 
     name = "seed_variance"
-    title = "The luck of initial weights"
+    title = "Seed variance"
     part = "initialization"

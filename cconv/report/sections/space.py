@@ -1,10 +1,10 @@
-"""What was searched."""
+"""The section on the search space."""
 
 from cconv.report.sections.section import LastingSection
 
 
 class SpaceSection(LastingSection):
-    """The hyperparameters of the search space, with their domains and reasons."""
+    """Show the hyperparameters of the search space with their domains and reasons."""
 
     name = "space"
-    title = "What was searched"
+    title = "Search space"

@@ -1,4 +1,4 @@
-"""Where the models fail: what every check of stability found in every finalist."""
+"""The section on stability: what every check found in every finalist."""
 
 from itertools import groupby
 from typing import Any
@@ -9,13 +9,13 @@ from cconv.study.records.summary import Summary
 
 
 class StabilitySection(Section):
-    """Findings of the checks in all finalists, each with its limit."""
+    """Show the findings of the checks in all finalists, each with its limit."""
 
     name = "stability"
     title = "Stability"
     part = "checks"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """The rows of each check, by its name."""
+        """Return the rows of each check, by its name."""
         rows = groupby(verdict_matrix(summary), key=lambda row: row.check)
         return {"rows_of": {check: list(found) for check, found in rows}}

@@ -1,11 +1,11 @@
-"""Search strategies replayed on trials that nothing stopped."""
+"""The section on stopping rules replayed on trials that were all trained to the full budget."""
 
 from cconv.report.sections.section import Section
 
 
 class StrategiesSection(Section):
-    """What each strategy would have spent and lost."""
+    """Show what each stopping rule would have spent, and how much larger its error would have been."""
 
     name = "strategies"
-    title = "Strategies replayed"
+    title = "Stopping rules replayed"
     part = "strategies"

@@ -1,4 +1,4 @@
-"""How sure the choice is: every finalist beside the best, and what other seeds and units would give."""
+"""The section on the certainty of the choice: every finalist compared with the best, over seeds and units."""
 
 from typing import Any
 
@@ -7,13 +7,13 @@ from cconv.study.records.summary import Summary
 
 
 class SureSection(Section):
-    """The comparison that the choice rests on, the front as one number, and what intervals cover."""
+    """Show the comparison behind the choice, the hypervolume of the front, and how the intervals are meant."""
 
     name = "sure"
-    title = "How sure are we?"
+    title = "How certain is the choice?"
     part = "selection"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """Numbers of seeds and test units."""
+        """Return the numbers of seeds and test units."""
         tests = [entry.test for entry in summary.finalists]
         return {"seeds": max(len(test.by_seed) for test in tests), "units": tests[0].units.count}

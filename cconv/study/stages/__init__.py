@@ -1,6 +1,6 @@
-"""The kinds of stages of a study, one file each: its settings beside what it does.
+"""The kinds of stages of a study. One file holds the settings and the code of one kind.
 
-A new kind is a subclass of `Stage` in a file named after it, and a line in this list.
+To add a kind, write a subclass of `Stage` in a file named after it and add a line to this list.
 """
 
 from cconv.study.declared.stage import Stage

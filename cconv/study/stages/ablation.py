@@ -1,7 +1,8 @@
-"""The ablation stage: what each change between the baseline and the best model brings, by real retrainings.
+"""The ablation stage retrains models to measure how much each change between the baseline and the best model brings.
 
-One path changes one hyperparameter after another from the baseline to the best trained finalist. And the best finalist
-of all is built anew with each of its branches and features toggled: what it has is left out, what it lacks is added.
+Models on a path from the baseline to the best trained finalist differ from their predecessor in one hyperparameter. The
+best finalist of all is also retrained, or refitted if it is a closed form, with each optional feature (walls, density)
+removed if it has the feature and added if it lacks it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from cconv.validation import Whole
 
 
 class AblationStage(Stage):
-    """Retrain models between the baseline and the best finalist, and the best finalist without each of its parts."""
+    """Retrain models between the baseline and the best finalist, and the best finalist with each feature toggled."""
 
     kind: Literal["ablation"] = "ablation"
     uses = ("initialization", "random", "finalists")
@@ -30,27 +31,27 @@ class AblationStage(Stage):
     seeds: Whole = Field(1, ge=1, le=1000)
 
     def run(self, session: Session, name: str) -> Found:
-        """Retrain the path and the toggled models; returns the ablation.
+        """Retrain the path and the toggled models and return the ablation.
 
-        A step of the path above the space's caps on cost is not trained and has no error.
+        A model above the space's caps on cost is not trained and has no error.
         """
         finalists = _finalists(session, name)
         trained = [finalist for finalist in finalists if not finalist.records[0].is_closed_form]
         found = [finalist for finalist in trained if finalist.id != BASELINE]
         path = _path(session, name, found) if found else {}
         best = min(finalists, key=_mean_error)
-        branches = toggled(session, best)
+        variants = toggled(session, best)
         if best.records[0].is_closed_form:
             self._train(session, name, path)
-            _fit(session, name, branches, best.records[0].config["ridge"])
+            _fit(session, name, variants, best.records[0].config["ridge"])
         else:
-            self._train(session, name, path | branches)
+            self._train(session, name, path | variants)
         ablation = Ablation(
             of=best.id,
             error=_mean_error(best),
             path=[_step(session, f"{name}_{change}", change, each) for change, each in path.items()],
             branches=[
-                _step(session, f"{name}_{feature}", feature_path(feature), each) for feature, each in branches.items()
+                _step(session, f"{name}_{feature}", feature_path(feature), each) for feature, each in variants.items()
             ],
         )
         return Found(ablation=ablation)
@@ -69,7 +70,7 @@ class AblationStage(Stage):
 
 def _fit(session: Session, stage: str, models: Mapping[str, dict], ridge: float) -> None:
     """Fit the models as closed forms."""
-    seed = session.study.seeds.init + 1  # names the folder, as that of trained ones
+    seed = session.study.seeds.init + 1  # names the folder, as the seed of a training does
     for change, parameters in models.items():
         fit_whole(session, parameters, session.run.finalist(f"{stage}_{change}", seed), stage, seed, ridge)
 
@@ -81,13 +82,14 @@ def _finalists(session: Session, stage: str) -> list[Retrained]:
 
 
 def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str, dict]:
-    """Configurations from the baseline to the best trained finalist, by the hyperparameter that each one changes.
+    """List the configurations from the baseline to the best trained finalist, by the hyperparameter that each changes.
 
-    The order comes from a surrogate of the errors at the highest rung that enough trials reached; none where the study
-    is too small for that.
+    The order comes from a surrogate of the errors at the highest rung that enough trials reached. The path is empty if
+    no rung has enough trials.
     """
-    from cconv.study.evidence.ablation_path import ablation_order, path_configurations  # scikit-learn: no reader of a
-    from cconv.study.evidence.surrogate import FEWEST_TRIALS  # study file shall wait for it
+    # scikit-learn loads slowly, so only a running stage imports it.
+    from cconv.study.evidence.ablation_path import ablation_order, path_configurations
+    from cconv.study.evidence.surrogate import FEWEST_TRIALS
 
     best, baseline = min(found, key=_mean_error).records[0].parameters, session.space.baseline
     known = session.read(stage, "initialization", "random")
@@ -103,7 +105,7 @@ def _path(session: Session, stage: str, found: Sequence[Retrained]) -> dict[str,
 
 
 def toggled(session: Session, best: Retrained) -> dict[str, dict]:
-    """Hyperparameters of the best finalist with each feature that the scene offers toggled, by the feature's name."""
+    """Return the hyperparameters of the best finalist with one optional feature of the scene toggled, by feature."""
     parameters = best.records[0].parameters
     features = configure(parameters, session.study.configuration).features
     optional = session.problem.task.optional

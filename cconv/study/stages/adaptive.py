@@ -1,4 +1,4 @@
-"""The adaptive stage: each configuration proposed from the trials before it, stopped by ASHA."""
+"""The adaptive stage proposes each configuration from the trials before it and stops bad trials early (ASHA)."""
 
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -14,16 +14,16 @@ from cconv.validation import Value
 
 
 class AdaptiveStage(SearchStage):
-    """Search with ASHA by a tree-structured Parzen estimator of error and cost.
+    """Search for small error and cost with a tree-structured Parzen estimator (TPE), and stop bad trials early (ASHA).
 
-    The estimator learns from the stages that this one reads and from the trials before each trial.
+    The estimator learns from the trials of the stages that this one reads and from the earlier trials of its own.
     """
 
     kind: Literal["adaptive"] = "adaptive"
     uses = ("baseline", "initialization", "random")
 
     def jobs(self, session: Session, name: str) -> Iterator[Job]:
-        """The trials, each proposed from the records of the stages that it reads and of the trials before it."""
+        """Yield the trials; each is proposed from the trials of the stages that are read and from those before it."""
         space, earlier = session.space_of(name), session.read(name)
         for number in range(self.trials):
             recorded = session.run.trial(trial_name(name, number)).parameters
@@ -33,7 +33,7 @@ class AdaptiveStage(SearchStage):
 def _proposed(
     session: Session, stage: str, number: int, space: SearchSpace, earlier: Sequence[TrialRecord]
 ) -> dict[str, Value]:
-    """Hyperparameters of a trial, from the records that there are when it is asked for."""
+    """Propose the hyperparameters of a trial from the records that exist at this moment."""
     known = [*earlier, *session.run.trials_of(stage)]
     costs = {record.id: record.config["flops_per_particle"] for record in known}
     return suggest_parameters(

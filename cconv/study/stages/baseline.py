@@ -1,4 +1,4 @@
-"""The baseline stage (thesis, 4.2): the published network trained to the full budget, as every trial could be."""
+"""The baseline stage (thesis, 4.2) trains the baseline of the search space once to the full budget."""
 
 from typing import Literal
 
@@ -9,7 +9,7 @@ from cconv.study.stages.session import Session
 
 
 class BaselineStage(Stage):
-    """Train the published network to the full budget, as every trial could be."""
+    """Train the baseline, the published network in most spaces, to the full budget of a trial."""
 
     kind: Literal["baseline"] = "baseline"
 

@@ -1,8 +1,8 @@
-"""The closed-form stage: least squares for every single linear layer that a search space holds.
+"""The closed-form stage fits single linear layers of the search space by least squares.
 
 Such a layer needs no training and no seed: its coefficients are the solution of linear equations. Candidates are fitted
-to a few frames and compared on a few others; some of those that none beats in error and cost are fitted to the whole
-training split and become finalists.
+to a few training frames and compared on a few validation frames. The best on the Pareto front of error and cost are
+later fitted to the whole training split and become finalists.
 """
 
 import math
@@ -36,14 +36,14 @@ from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
 from cconv.validation import Value, Whole
 
-MOST_LAYERS = 50_000  # that are listed; a space may hold any number of them
+MOST_LAYERS = 50_000  # listed at most; a space may hold any number of single layers
 
 
 class ClosedFormStage(Stage):
     """Fit the single linear layers of the space by least squares.
 
-    At most `max_candidates` layers are fitted to `screening_frames` frames, ranges sampled at `values_per_range`
-    places; the `count` best are fitted to all frames and become finalists.
+    At most `max_candidates` layers are fitted to `screening_frames` frames; a numeric range contributes
+    `values_per_range` values. The stage of the finalists fits the `count` best to all frames.
     """
 
     kind: Literal["closed_form"] = "closed_form"
@@ -54,10 +54,10 @@ class ClosedFormStage(Stage):
     ridge: Ridge = 1e-10
 
     def run(self, session: Session, name: str) -> Found:
-        """Fit candidates to a few frames and record their errors on a few others, as many as the study allows.
+        """Fit candidates to a few training frames and record their errors on a few validation frames.
 
-        Half of them are drawn from all layers that the space holds, as many of each architecture; the others are
-        proposed from the records of those before.
+        Half of the candidates are drawn from all single layers of the space, as many of each architecture. The others
+        are proposed from the records of the candidates before them.
         """
         layers = single_layers(session.space, session.study.network, self.values_per_range)
         samples = self._screening_samples(session.problem)
@@ -76,7 +76,7 @@ class ClosedFormStage(Stage):
         return Found()
 
     def winners(self, session: Session, name: str) -> list[TrialRecord]:
-        """The candidates so far that would become finalists, most accurate first."""
+        """Return the candidates so far that would become finalists, most accurate first."""
         records = session.run.trials_of(name)
         cost = {record.id: record.config["flops_per_particle"] for record in records}
         return choose_finalists(records, cost, self.count, session.study.selection.accurate_enough)
@@ -90,10 +90,10 @@ class ClosedFormStage(Stage):
 
 
 def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range: int) -> list[dict[str, Value]]:
-    """Distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
+    """List the distinct settings of a single linear layer in a space; ranges are sampled evenly, both ends included.
 
-    Conditions hold as in the search. A space of deeper networks only has single layers too, as a floor to compare with.
-    Of a space that holds more than `MOST_LAYERS` of them, so many are drawn at random.
+    Conditions hold as in the search. A space of deeper networks also has single layers, to compare the deeper ones
+    with. If there are more than `MOST_LAYERS`, that many are drawn at random.
 
     Args:
         space: The search space.
@@ -120,17 +120,17 @@ def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range
 
 
 def _paths(settings: Mapping[str, Value]) -> dict[str, Value]:
-    """Settings of a network by their paths."""
+    """Map the paths of network settings to their values."""
     return {f"{NETWORK}.{name}": value for name, value in settings.items()}
 
 
 def _applies(settings: type[NetworkSettings]) -> set[str]:
-    """Paths of the hyperparameters that a single layer of an architecture has."""
+    """List the paths of the hyperparameters that a single layer of an architecture has."""
     return {*(f"{NETWORK}.{name}" for name in settings.linear_settings), *map(feature_path, OPTIONAL_FEATURES)}
 
 
 def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
-    """Each layer with each of its choices, in order; `MOST_LAYERS` of them, drawn at random, where there are more."""
+    """Combine each layer with each of its choices, in order; draw `MOST_LAYERS` at random if there are more."""
     ends = list(accumulate(map(len, choices)))
     places: Sequence[int] = range(ends[-1])
     if len(places) > MOST_LAYERS:
@@ -140,10 +140,10 @@ def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list
 
 
 def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]]) -> list[dict[str, Value]]:
-    """The layers to fit next, given those that would become finalists now; none where nothing near them is left.
+    """Propose the layers to fit next, near those that would become finalists now; return none if all were tried.
 
-    First the winners with every other number of basis functions, which decides more than anything else; then the
-    layers that differ from a winner in one setting. The most accurate winner comes first.
+    The first proposals are the winners with every other number of basis functions, the most important setting. The
+    next ones differ from a winner in one setting. The most accurate winner comes first.
     """
     with_other_terms = [layer for record in winners for layer in untried if _same_but_basis_size(record, layer)]
     if with_other_terms:
@@ -152,28 +152,28 @@ def propose(winners: Sequence[TrialRecord], untried: Sequence[dict[str, Value]])
 
 
 def _same_but_basis_size(record: TrialRecord, layer: Mapping[str, Value]) -> bool:
-    """Whether a layer differs from that of a record in the number of its basis functions alone."""
+    """Tell whether a layer differs from the layer of a record only in its number of basis functions."""
     path = f"{NETWORK}.{ARCHITECTURES[str(layer[ARCHITECTURE])].basis_size}"
     return path in layer and record.parameters | {path: layer[path]} == layer
 
 
 def _neighbors(layer: Mapping[str, Value], others: Iterable[dict[str, Value]]) -> list[dict[str, Value]]:
-    """The layers that differ in one setting; what comes and goes with an architecture counts with it."""
+    """List the layers that differ in one setting; settings that only one of two architectures has are ignored."""
     return [other for other in others if sum(layer[name] != other[name] for name in layer if name in other) == 1]
 
 
 def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[str, dict[str, Value]]:
     """Fit the best candidates to the whole training split, without the features that they do not need.
 
-    Each is fitted once, as nothing in it is drawn.
+    Each is fitted once, because a closed form has no random initial weights.
 
     Args:
         session: The study.
-        stage: The stage of the finalists, which reads stages of closed forms.
+        stage: Name of the stage of the finalists, which reads the stages of closed forms.
         seed: Seed that names the folder.
 
     Returns:
-        Hyperparameters of the finalists, by id; that of one that lost a feature says so.
+        Hyperparameters of the finalists, by id; the id of a finalist that lost a feature says so.
     """
     study = session.study
     chosen: dict[str, tuple[str, dict[str, Value]]] = {}
@@ -189,12 +189,13 @@ def fit_closed_form_finalists(session: Session, stage: str, seed: int) -> dict[s
 def without_unneeded_features(
     session: Session, candidate: TrialRecord, seed: int, ridge: float
 ) -> tuple[str, dict[str, Value]]:
-    """Drop each optional feature that the validation error of a candidate does not need.
+    """Drop each optional feature (walls, density) that a candidate does not need.
 
-    A feature goes if the space can do without it and the error grows by no more than the margin of non-inferiority.
+    A feature is dropped if the space allows it and the validation error grows by no more than the margin of
+    non-inferiority.
 
     Returns:
-        The id of what remains, which names the dropped features, and its hyperparameters.
+        The id of the model that remains, which names the dropped features, and its hyperparameters.
     """
 
     def fitted(finalist: str, parameters: Mapping[str, Value]) -> float:
@@ -231,7 +232,7 @@ def _fit_and_record(
     init_seed: int,
     ridge: float,
 ) -> None:
-    """Fit a layer to the first of `samples` and record its error on the second. No weight depends on the seed."""
+    """Fit a layer to the first of `samples` and record its error on the second; no weight depends on the seed."""
     folder.check_begun_with(parameters)
     if folder.ended:
         return
@@ -269,7 +270,7 @@ def _fit_and_record(
 
 
 def _draw(layers: list[dict[str, Value]], count: int, seed: int) -> list[dict[str, Value]]:
-    """At most `count` layers, as many of each architecture as there are, drawn at random where there are more."""
+    """Draw at most `count` layers at random, equally many of each architecture as far as there are enough."""
     drawn = [layers[index] for index in np.random.default_rng(seed).permutation(len(layers))]
     rank: Counter[Value] = Counter()
     ranked = []

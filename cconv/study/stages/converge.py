@@ -1,8 +1,8 @@
-"""The converge stage: finalists trained again with larger and larger budgets until the validation error stops falling.
+"""The converge stage trains finalists with larger and larger budgets until their validation error stops falling.
 
-A small budget says what a network reaches quickly, not what it can reach. A model takes the next budget of the stage as
-long as the last one lowered its mean validation error by more than the margin of non-inferiority. Every training starts
-afresh, as a learning rate that fades with the budget cannot be continued.
+A small budget shows how fast a network learns, not how accurate it can become. A model takes the next budget as long as
+the last one lowered its mean validation error by more than the margin of non-inferiority. Every training starts from
+new weights, because the learning-rate schedule is tied to the budget and cannot be continued.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from cconv.validation import Name, Whole
 class ConvergeStage(Stage):
     """Train finalists with each of `budgets` (gradient updates, ascending) until more no longer lowers the error.
 
-    `of` names the baseline or configurations that a stage of finalists includes; None means every trained finalist.
+    `of` names the baseline or configurations in `include` of a stage of finalists; None means every trained finalist.
     """
 
     kind: Literal["converge"] = "converge"
@@ -45,11 +45,11 @@ class ConvergeStage(Stage):
         return self.of or ()
 
     def run(self, session: Session, name: str) -> Found:
-        """Train the finalists that the stage names with its budgets, one after another.
+        """Train the named finalists with one budget after another.
 
         Returns:
-            The convergence of each model; and as finalists the longest training of each, by an id that ends in its
-            updates.
+            The convergence of each model, and its longest training as a further finalist, whose id ends in its number
+            of updates.
         """
         own = finalist_training(session.study).updates
         models = _named(_trained_finalists(session, name), self.of)
@@ -69,7 +69,7 @@ class ConvergeStage(Stage):
 
 
 def _train_with(session: Session, stage: str, models: Mapping[str, dict], updates: int) -> dict[str, BudgetPoint]:
-    """Train models with a budget; returns the point of each whose trainings all finished."""
+    """Train models with a budget; return the point of each model all of whose trainings finished."""
     study = session.study
     training = study.training.model_copy(update={"updates": updates})
     longer = [Finalist(id=f"{model}_after_{updates}", parameters=parameters) for model, parameters in models.items()]
@@ -79,7 +79,7 @@ def _train_with(session: Session, stage: str, models: Mapping[str, dict], update
 
 
 def _trained_finalists(session: Session, stage: str) -> dict[str, dict]:
-    """Hyperparameters of the finalists that were trained, and not fitted, by id."""
+    """Return the hyperparameters of the trained finalists by id, without closed forms."""
     retrainings = session.run.retrainings()
     found: dict[str, dict] = {}
     for name in reads_of(session.study.stages, stage):
@@ -92,7 +92,7 @@ def _named(models: Mapping[str, dict], names: Sequence[str] | None) -> dict[str,
 
 
 def _point(session: Session, finalist: str, updates: int) -> BudgetPoint | None:
-    """Mean validation error of a finalist's trainings with one budget; None if not all of them finished."""
+    """Average the validation errors of a finalist's trainings with one budget; None if a training did not finish."""
     retrained, _ = retrained_finalists(session.run, [finalist], session.study.finalists.seeds)
     if not retrained:
         return None

@@ -1,4 +1,7 @@
-"""Finalists: the best configurations and the baseline retrained with fresh seeds, tested and timed."""
+"""The finalists stage retrains the best configurations and the baseline with fresh seeds.
+
+The select stage evaluates, times and compares them with the functions at the end of this file.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,7 +41,7 @@ class Finalist:
     """A configuration that is retrained.
 
     Attributes:
-        id: "baseline" or the id of the trial that found it.
+        id: "baseline", the id of the trial that found the configuration, or its name in the study file.
         parameters: Its hyperparameters.
     """
 
@@ -62,19 +65,19 @@ class Retrained:
 
     @property
     def valid_errors(self) -> list[float]:
-        """Validation error of each checkpoint: the best of its evaluations."""
+        """Validation error of each checkpoint, the smallest of its training."""
         return [record.best for record in self.records]
 
     @property
     def best_checkpoint(self) -> Path:
-        """Checkpoint of the smallest validation error."""
+        """Checkpoint with the smallest validation error."""
         return self.checkpoints[int(np.argmin(self.valid_errors))]
 
 
 class FinalistsStage(Stage):
     """Retrain the `count` best configurations and the baseline with fresh seeds; fit the best closed forms.
 
-    `include` names further configurations, e.g. a published one, by the id that they get.
+    `include` holds further configurations, e.g. a published one, by the id that they get.
     """
 
     kind: Literal["finalists"] = "finalists"
@@ -114,7 +117,7 @@ class FinalistsStage(Stage):
         return Found(finalists=finalists)
 
     def _best_trials(self, session: Session, name: str) -> list[TrialRecord]:
-        """The best trained configurations of the searches that the stage reads, the baseline's own left out."""
+        """Return the best trained configurations of the searches that the stage reads, without the baseline."""
         records = session.read(name, "random", "adaptive")
         others = [record for record in records if record.parameters != session.space.baseline]
         cost = {record.id: record.config["flops_per_particle"] for record in others}
@@ -122,21 +125,21 @@ class FinalistsStage(Stage):
 
 
 def check_any_finished(run: RunFolder, finished: Sequence[Retrained], failed: Mapping[str, str]) -> None:
-    """Raise `StudyError` with what became of each finalist unless one of them finished its training."""
+    """Raise `StudyError`, with the outcome of each training, if no finalist finished its trainings."""
     if not finished:
         ends = ". ".join(f"{finalist}: {end}" for finalist, end in failed.items())
         raise StudyError(f"{run.path}: no finalist finished its training ({ends}); see trials/ and finalists/ there.")
 
 
 def finalist_training(study: StudyConfig) -> TrainingConfig:
-    """Training settings of the finalists: the search's, with their own budget."""
+    """Return the training settings of the finalists: those of the search with the finalists' budget."""
     return study.training.model_copy(update={"updates": study.finalists.updates or study.training.updates})
 
 
 def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int, run: RunFolder) -> list[Job]:
-    """Trainings of every finalist with `num_seeds` initialisation seeds that the search did not use.
+    """List the trainings of every finalist with `num_seeds` initialisation seeds that the search did not use.
 
-    They run in this order; the costliest finalist, usually the baseline, is best given first.
+    The trainings run in this order; give the costliest finalist, usually the baseline, first.
     """
     return [
         job_in(run.finalist(finalist.id, seed), f"{finalist.id}/seed_{seed}", finalist.parameters, seed)
@@ -148,7 +151,14 @@ def finalist_jobs(finalists: Sequence[Finalist], num_seeds: int, first_seed: int
 def retrained_finalists(
     run: RunFolder, finalists: Iterable[str], num_seeds: int
 ) -> tuple[list[Retrained], dict[str, str]]:
-    """Finalists all of whose seeds finished, a closed form's single fit, and for each other one what became of it."""
+    """Separate the finalists whose trainings all finished, one fit for a closed form, from the failed ones.
+
+    Returns:
+        The finished finalists, and by the id of each other one how its trainings ended.
+
+    Raises:
+        DataError: If the records of a finalist are missing.
+    """
     retrained, failed = [], {}
     retrainings = run.retrainings()
     for finalist in finalists:
@@ -169,13 +179,13 @@ def retrained_finalists(
 def evaluate_finalist(
     finalist: Retrained, objective: Objective, samples: Sequence[Sample], frames_per_block: int
 ) -> tuple[Errors, np.ndarray]:
-    """Errors of a finalist on a split, over its seeds.
+    """Measure the errors of a finalist on a split, over its seeds.
 
     Args:
         finalist: The finalist.
-        objective: What finalists are compared by.
+        objective: The error that finalists are compared by.
         samples: Frames of the split.
-        frames_per_block: Frames of a unit where the split has a single trajectory.
+        frames_per_block: Frames of a unit if the split has a single trajectory.
 
     Returns:
         The mean errors, and the errors of each seed and unit (seeds, units).
@@ -205,7 +215,7 @@ def _mean_of_seeds(values: Sequence[float | None]) -> float | None:
 def finalist_entry(
     finalist: Retrained, valid: Errors, test: Errors, cost: Cost, stability: Stability, run: RunFolder
 ) -> FinalistEntry:
-    """A finalist's entry in summary.json."""
+    """Build the entry of a finalist in summary.json."""
     config = finalist.records[0].config
     return FinalistEntry(
         id=finalist.id,

@@ -1,7 +1,8 @@
-"""The initialisation stage (thesis, 4.1), a study of the variance over seeds beside that over configurations.
+"""The initialisation stage (thesis, 4.1) compares the variance of the error over seeds with that over configurations.
 
-The baseline is trained with many seeds, and many random configurations with one seed; nothing is stopped. So the same
-trainings tell at every rung how much of the spread comes from the seed, and how well a rung predicts the full budget.
+The baseline is trained with many seeds, and many random configurations with one seed, all to the full budget. So the
+same trainings show at every rung how much of the variance comes from the initial weights, and how well the order of
+trials at the rung predicts their order at the full budget.
 """
 
 from typing import Literal
@@ -23,9 +24,9 @@ from cconv.validation import Whole
 
 
 class InitializationStage(Stage):
-    """Train the baseline with `seeds` initial weights, and `configurations` of the space with one; stop nothing.
+    """Train the baseline with `seeds` initial weights and `configurations` random configurations with one seed.
 
-    The trainings tell the variance over initial weights from that over configurations, and audit the rungs.
+    No training is stopped early. The stage measures the seed variance, audits the rungs and replays stopping rules.
     """
 
     kind: Literal["initialization"] = "initialization"
@@ -33,7 +34,7 @@ class InitializationStage(Stage):
     configurations: Whole = Field(16, ge=2, le=MOST_TRIALS)
 
     def run(self, session: Session, name: str) -> Found:
-        """Train them; returns the two variances, the audit of the rungs, and the replayed strategies."""
+        """Train them and return both variances, the audit of the rungs and the replayed stopping rules."""
         study, seed = session.study, session.seed_of(name)
         train_all(session, name, self._jobs(session, name), study.training)
         seeds, configurations = by_purpose(session.run, name, study.seeds.init)
@@ -47,7 +48,7 @@ class InitializationStage(Stage):
 
     def _jobs(self, session: Session, name: str) -> list[Job]:
         study, space = session.study, session.space
-        first = study.seeds.init + 1 + study.finalists.seeds  # seeds that no other stage uses
+        first = study.seeds.init + 1 + study.finalists.seeds  # these seeds are used by no other stage
         trainings = [(space.baseline, first + number) for number in range(self.seeds)]
         for number in range(self.configurations):
             drawn = random_parameters(space, session.seed_of(name), number, session.affordable)
@@ -56,7 +57,7 @@ class InitializationStage(Stage):
 
 
 def by_purpose(run: RunFolder, stage: str, search_seed: int) -> tuple[list[TrialRecord], list[TrialRecord]]:
-    """The stage's trainings of the baseline with many seeds, and those of many configurations with the search's."""
+    """Split the trainings into those of the baseline with many seeds and those with the search's seed."""
     records = run.trials_of(stage)
     configurations = [record for record in records if record.config["init_seed"] == search_seed]
     return [record for record in records if record not in configurations], configurations

@@ -1,4 +1,4 @@
-"""The random stage: independent draws from the space, stopped by ASHA."""
+"""The random stage draws independent configurations from the space and stops bad trials early (ASHA)."""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -11,12 +11,12 @@ from cconv.study.stages.session import Session
 
 
 class RandomStage(SearchStage):
-    """Search at random with ASHA, in the study's space or in the one that the stage `space` refined."""
+    """Search at random with early stopping (ASHA), in the study's space or in the one narrowed by the stage `space`."""
 
     kind: Literal["random"] = "random"
 
     def jobs(self, session: Session, name: str) -> Iterator[Job]:
-        """The trials, each drawn from a stream of its own."""
+        """Yield the trials, each drawn from a random stream of its own."""
         space, seed = session.space_of(name), session.seed_of(name)
         for number in range(self.trials):
             yield trial_job(session, name, number, random_parameters(space, seed, number, session.affordable))

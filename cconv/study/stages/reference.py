@@ -1,7 +1,7 @@
-"""The reference stage: what another rule than ASHA's finds with the same budget.
+"""The reference stage compares ASHA with another stopping rule at the same budget.
 
-The other rule is early discarding after one rung: every trial is trained to the first rung, and the best of them to the
-end, as many as the budget pays for.
+The other rule is early discarding after one rung: every trial is trained to the first rung, and only the best of them
+to the full budget, as many as the updates that ASHA spent would pay for.
 """
 
 import math
@@ -17,17 +17,17 @@ from cconv.study.stages.session import Session
 
 
 class ReferenceStage(Stage):
-    """Spend the budget of each search that is read by another rule: each trial a little, the best to the end."""
+    """Compare each search with the rule that trains all trials to the first rung and the best to the full budget."""
 
     kind: Literal["reference"] = "reference"
     uses = ("random", "adaptive")
     needs_records = True
 
     def run(self, session: Session, name: str) -> Found:
-        """Train what ASHA stopped and the other rule would not have, and compare both at the same budget.
+        """Train the trials that ASHA stopped but the other rule keeps, and compare both rules at the same budget.
 
-        Every trial of a search was measured at the first rung. What the search spent beyond that pays for the full
-        training of the trials that are best there; those of them that ASHA stopped are trained to the end.
+        Every trial of a search was measured at the first rung. The updates that the search spent beyond it pay for the
+        full training of the trials that are best there. Those of them that ASHA stopped are trained again.
         """
         study, run = session.study, session.run
         read = {search: run.trials_of(search) for search in reads_of(study.stages, name)}
@@ -62,7 +62,7 @@ def kept_at_same_budget(records: Sequence[TrialRecord], rungs: Sequence[int]) ->
 
 
 def _train_stopped(session: Session, stage: str, kept: Sequence[TrialRecord]) -> dict[str, TrialRecord]:
-    """Train those of the kept trials that ASHA stopped to the end; returns their new records by their ids."""
+    """Train the kept trials that ASHA stopped to the full budget; return their new records by the ids of the trials."""
     stopped = [record for record in kept if record.outcome == "stopped"]
     jobs = [trial_job(session, stage, number, record.parameters) for number, record in enumerate(stopped)]
     train_all(session, stage, jobs, session.study.training)
@@ -71,7 +71,7 @@ def _train_stopped(session: Session, stage: str, kept: Sequence[TrialRecord]) ->
 
 
 def _by_asha(records: Sequence[TrialRecord]) -> SearchStrategy:
-    """What the search itself spent and found."""
+    """Summarise what the search itself spent and found."""
     curve = best_so_far(records)
     return SearchStrategy(
         updates=sum(record.log[-1]["updates"] for record in records if record.log),
@@ -81,7 +81,7 @@ def _by_asha(records: Sequence[TrialRecord]) -> SearchStrategy:
 
 
 def _by_first_rung(finals: Sequence[TrialRecord], num_trials: int, rungs: Sequence[int]) -> SearchStrategy:
-    """What the other rule spends and finds: each trial to the first rung, then the finals to the end, one by one."""
+    """Summarise what the other rule spends and finds; `finals` are the trials that it trains to the full budget."""
     spent, best, curve = num_trials * rungs[0], math.inf, []
     for record in finals:
         spent += rungs[-1] - rungs[0]

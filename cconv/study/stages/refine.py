@@ -1,4 +1,4 @@
-"""The refine stage (thesis, 4.3.1): a narrower search space, by what earlier trials showed."""
+"""The refine stage (thesis, 4.3.1) narrows the search space by the evidence of earlier trials."""
 
 from typing import Literal
 
@@ -9,14 +9,14 @@ from cconv.study.stages.session import Session
 
 
 class RefineStage(Stage):
-    """Narrow the space from the records that are read, with a reason for each parameter."""
+    """Narrow the space from the records of earlier stages, with a reason for each hyperparameter."""
 
     kind: Literal["refine"] = "refine"
     uses = ("baseline", "initialization", "random")
     needs_records = True
 
     def run(self, session: Session, name: str) -> Found:
-        """Write the narrowed space to ``stages/<name>.toml``; returns the reason for each parameter."""
+        """Write the narrowed space to ``stages/<name>.toml``; return the reason for each hyperparameter."""
         space, reasons = refine(session.space, session.read(name), session.study.training.updates)
         path = session.run.path / "stages" / f"{name}.toml"
         path.parent.mkdir(exist_ok=True)

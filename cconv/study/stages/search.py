@@ -1,4 +1,4 @@
-"""What the kinds of searches share: how many trials, in which space, and how ASHA stops them."""
+"""The common part of the searches: number of trials, search space, and early stopping by ASHA."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -12,9 +12,9 @@ from cconv.validation import Name
 
 
 class SearchStage(Stage):
-    """A stage that trains `trials` configurations with ASHA.
+    """A stage that trains `trials` configurations and stops bad ones early (ASHA).
 
-    They come from the study's space, or from the one that the stage `space` refined.
+    Configurations come from the study's space, or from the one narrowed by the stage `space`.
     """
 
     space_kinds = ("refine",)
@@ -28,10 +28,10 @@ class SearchStage(Stage):
 
     @abstractmethod
     def jobs(self, session: Session, name: str) -> Iterator[Job]:
-        """The trials of the search, each made when it is asked for."""
+        """Yield the trials of the search, each made when it is asked for."""
 
     def run(self, session: Session, name: str) -> Found:
-        """Train the trials; those that ASHA stops are left where they are."""
+        """Train the trials; a trial that ASHA stops is not trained further."""
         study = session.study
         file = RungFile(session.run.path / "rungs.json")
         table = file.table(name, study.rungs, study.search.reduction_factor)

@@ -1,4 +1,4 @@
-"""The select stage: one finalist chosen by validation, time and stability, all tested, and the study summed up."""
+"""The select stage recommends a finalist by validation error, time and stability, tests all, and writes the summary."""
 
 import math
 import time
@@ -61,7 +61,7 @@ GROWTH_REPEATS = 3
 
 
 class SelectStage(Stage):
-    """Test, time and stress the finalists and recommend one."""
+    """Compare the finalists, recommend one, then test all of them."""
 
     kind: Literal["select"] = "select"
     uses = ("finalists", "converge")
@@ -70,7 +70,7 @@ class SelectStage(Stage):
     def run(self, session: Session, name: str) -> Found:
         """Choose a finalist by validation errors, time and stability; then read the test split, once.
 
-        Writes summary.json; returns the id of the finalist.
+        Write summary.json and return the id of the chosen finalist.
 
         Raises:
             StudyError: If no finalist could be retrained.
@@ -81,7 +81,7 @@ class SelectStage(Stage):
 
 
 def _summary(session: Session, stage: str, start: float) -> Summary:
-    """Judge, test and explain the finalists, in a stage that began at a time of the performance counter."""
+    """Compare, test and explain the finalists; `start` is the performance counter at the beginning of the stage."""
     study, run = session.study, session.run
     finalists, failed = _finalists(session, stage)
     check_any_finished(run, finalists, failed)
@@ -129,18 +129,18 @@ def _complete_cards(run: RunFolder, finalists: Sequence[Retrained], tests: Mappi
 
 @dataclass(frozen=True, kw_only=True)
 class _Judged:
-    """What the finalists are chosen by, none of it from the test split.
+    """The measurements that the choice of a finalist rests on; none uses the test split.
 
     Attributes:
-        facts: Validation errors of each.
-        errors: The same by (seeds, units).
-        costs: Cost of each, and of some trials.
+        facts: Validation errors of each finalist.
+        errors: The same errors as tables (seeds, units).
+        costs: Cost of each finalist and of some trials.
         analytic: Cost of the analytic field, timed in turn with them.
-        times: Time of each.
-        checks: What each check of stability looks at, by name.
-        stability: What the checks found in each.
-        choose: Validation errors of the finalists to a recommendation.
-        chosen: The recommendation by all seeds.
+        times: Time of each finalist.
+        checks: Description of each check of stability, by name.
+        stability: Findings of the checks in each finalist.
+        choose: Function from validation errors to a recommendation.
+        chosen: The recommendation with all seeds.
     """
 
     facts: dict[str, Errors]
@@ -192,7 +192,7 @@ def _finalists(session: Session, stage: str) -> tuple[list[Retrained], dict[str,
 def _errors(
     session: Session, finalists: Sequence[Retrained], samples: Sequence[Sample], label: str
 ) -> tuple[dict[str, Errors], dict[str, np.ndarray]]:
-    """Errors of each finalist on a split, as facts and by (seeds, units)."""
+    """Measure the errors of each finalist on a split, as facts and as tables (seeds, units)."""
     frames = session.study.finalists.frames_per_block
     both = {
         each.id: evaluate_finalist(each, session.problem.objective, samples, frames)
@@ -202,7 +202,7 @@ def _errors(
 
 
 def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> MeanPredictor:
-    """What a model must be below on each split to know anything: the error of predicting the training mean there."""
+    """Measure the error of always predicting the training mean on each split; a useful model must be well below."""
     problem, objective = session.problem, session.problem.objective
     return MeanPredictor(
         valid=objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
@@ -211,7 +211,7 @@ def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> MeanPre
 
 
 def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
-    """Time of the finalists, of some trials from the cheapest to the costliest, and of the analytic field, in turn."""
+    """Time in turn the finalists, some trials from the cheapest to the costliest, and the analytic field."""
     settings, run, problem = session.study.cost, session.run, session.problem
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     trials = [record for record in run.trials() if record.last is not None and record.id not in checkpoints]
@@ -232,7 +232,7 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
-    """Time of the finalists and of the analytic field on blocks of fluid of growing size."""
+    """Time the finalists and the analytic field on blocks of fluid of growing size."""
     settings = session.study.cost
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
     sizes = settings.sizes
@@ -256,9 +256,9 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
 
 
 def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, str], dict[str, Stability]]:
-    """What each check of stability looks at, and what they found in every seed, all on validation trajectories.
+    """Run the checks of stability on every seed; return the description of each check and the findings per finalist.
 
-    The test split is only looked at for its errors.
+    All frames come from validation trajectories; the test split is only read for its errors.
     """
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
@@ -273,17 +273,17 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
 
 
 def _predictors(finalist: Retrained) -> dict[str, ModelPredictor]:
-    """Every training of a finalist as a predictor, by its name."""
+    """Make a predictor of every training of a finalist, by the name of the training."""
     trained = zip(finalist.records, finalist.checkpoints, strict=True)
     return {record.id: ModelPredictor(load_model(checkpoint)) for record, checkpoint in trained}
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
-    """Save filters, a predicted test frame and the distribution of errors of some finalists, for the report."""
+    """Save the filters, a predicted test frame and the error distribution of some finalists, for the report."""
     folder = run.path / "explanation"
     folder.mkdir(exist_ok=True)
     first = [sample for sample in samples if sample.trajectory == samples[0].trajectory]
-    frame = first[len(first) // 2]  # that of the start may be at rest
+    frame = first[len(first) // 2]  # not the first, which may be at rest
     for finalist in finalists:
         model = load_model(finalist.best_checkpoint)
         arrays: dict[str, Any] = explain(model, frame) | error_distribution(model, samples)
@@ -321,7 +321,10 @@ def _selection(judged: _Judged, test_errors: Mapping[str, np.ndarray], margin: f
 
 
 def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst: float) -> Front:
-    """Test errors: attainment band over seeds, and the hypervolume up to the mean predictor at the slowest time."""
+    """Describe the front of the test errors: attainment band over seeds, and hypervolume.
+
+    The reference point of the hypervolume is the mean predictor at the time of the slowest finalist.
+    """
     milliseconds = {name: timing.ms for name, timing in times.items()}
     area = hypervolume_interval(errors, milliseconds, (worst, max(milliseconds.values())))
     return Front(attainment=attainment(errors, milliseconds), hypervolume=area)
@@ -346,7 +349,7 @@ def _dataset(session: Session, test_samples: Sequence[Sample]) -> DatasetFacts:
 
 
 def _passed_rungs(session: Session) -> dict[str, list[PassedRung]]:
-    """How many trials of each search went on from each rung."""
+    """Count how many trials of each search continued beyond each rung."""
     study, file = session.study, RungFile(session.run.path / "rungs.json")
     factor = study.search.reduction_factor
     return {stage: file.table(stage, study.rungs, factor).passed() for stage in file.read()}
@@ -363,7 +366,7 @@ def _seconds_before(session: Session, stage: str) -> float:
 
 
 def _of_earlier_stages(session: Session, stage: str) -> Parts:
-    """What the stages before this one have found, their own parts of the summary."""
+    """Collect the parts of the summary that the stages before this one have found."""
     found: dict = {}
     names = list(session.study.stages)
     for name in names[: names.index(stage)]:

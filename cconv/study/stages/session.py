@@ -1,4 +1,4 @@
-"""What all stages of a run share."""
+"""The session: everything that the stages of a running study share."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,12 +32,12 @@ class Session:
         dataset: Its data.
         problem: Scene, task, training and validation samples.
         run: Where everything is recorded.
-        observer: Sees the trials as they run.
-        mirror: Repeats searches in Optuna's storage.
-        start_pool: Gives what trains the jobs of a stage; starts it at the first call.
+        observer: Is told about the trials as they run.
+        mirror: Copies the trials of searches to Optuna's storage.
+        start_pool: Returns the pool that trains the jobs of a stage; the first call starts it.
         count_cost: Counts the cost of a configuration, before anything is built.
         progress: Wraps an iterable to show progress, given a label.
-        useless_error: What predicting the training mean scores on the validation split.
+        useless_error: Error of predicting the training mean on the validation split.
     """
 
     study: StudyConfig
@@ -53,24 +53,24 @@ class Session:
     useless_error: float
 
     def read(self, stage: str, *kinds: str) -> list[TrialRecord]:
-        """Records of the stages that a stage reads, of some kinds only if any are named."""
+        """Read the records of the stages that a stage reads, or only of those of the named kinds."""
         stages = self.study.stages
         names = [name for name in reads_of(stages, stage) if not kinds or stages[name].kind in kinds]
         return [record for name in names for record in self.run.trials_of(name)]
 
     def seed_of(self, stage: str) -> int:
-        """Seed of a stage's draws: streams of stages and studies do not overlap, and no stage shifts another's."""
+        """Return the seed of a stage's random draws; streams of different stages and studies never overlap."""
         return int(np.random.SeedSequence([self.study.seeds.search, crc32(stage.encode())]).generate_state(1)[0])
 
     def space_of(self, stage: str) -> SearchSpace:
-        """The study's space, or the one that an earlier stage refined for this one."""
+        """Return the space of the study, or the one that an earlier stage narrowed for this stage."""
         refined = self.study.stages[stage].space_from
         if refined is None:
             return self.space
         return load_space(self.run.path / "stages" / f"{refined}.toml", self.study)
 
     def affordable(self, parameters: Mapping) -> bool:
-        """Whether a configuration is below the space's caps on cost, and possible in this scene."""
+        """Tell whether a configuration is below the space's caps on cost, and possible in this scene."""
         caps = self.space.caps
         try:
             return not caps or all(getattr(self.count_cost(parameters), name) <= cap for name, cap in caps.items())
@@ -78,5 +78,5 @@ class Session:
             return False
 
     def observers(self, mirrored: bool) -> Sequence[Observer]:
-        """Who sees the trials of a stage."""
+        """Return the observers that are told about the trials of a stage."""
         return [self.observer, self.mirror] if mirrored else [self.observer]
