@@ -16,11 +16,11 @@ class AnswerSection(Section):
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
         """Return the reason in two parts, and the baseline as ratios to the recommended model if they differ."""
         baseline = summary.finalist(summary.baseline)
-        is_other = baseline is not None and baseline is not summary.chosen
+        other = None if baseline is summary.chosen else baseline
         return {
             "reason": _lead(summary.recommended.reason),
-            "baseline": baseline if is_other else None,
-            "ratios": _ratios(baseline, summary.chosen) if is_other else {},
+            "baseline": other,
+            "ratios": {} if other is None else _ratios(other, summary.chosen),
         }
 
 
