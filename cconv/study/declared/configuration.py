@@ -146,7 +146,7 @@ def _architecture(parameters: Mapping[str, Value], defaults: Configuration) -> s
 
 
 def _check_features(parameters: Mapping[str, Value]) -> None:
-    """Check that whether a feature is taken is true or false."""
+    """Check that each feature is said to be taken or not by true or false."""
     for path in map(feature_path, OPTIONAL_FEATURES):
         if not isinstance(parameters.get(path, True), bool):
             raise ConfigError(f"not possible ({path}: must be true or false)")
