@@ -17,7 +17,7 @@ INTERRUPTED = 130
 
 app = typer.Typer(
     name="cconv",
-    rich_markup_mode="markdown",  # which fills paragraphs
+    rich_markup_mode="markdown",  # wraps paragraphs
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -47,8 +47,8 @@ def main() -> None:
     """Run the command line; bad input ends in one line on stderr and exit status 2, a study without a result in 1."""
     try:
         sys.exit(app(standalone_mode=False))
-    except typer.TyperException as error:  # an option or argument that does not exist or cannot be
-        if message := " ".join(error.format_message().split()):  # else help was asked for, and printed
+    except typer.TyperException as error:  # an unknown option or argument, or an impossible value
+        if message := " ".join(error.format_message().split()):  # empty if help was asked for and printed
             context = getattr(error, "ctx", None)
             help_of = context.command_path if context else "cconv"
             _print_refusal(f"{message.rstrip('.')}; see {help_of} --help.")
@@ -56,12 +56,12 @@ def main() -> None:
     except CConvError as error:
         _print_refusal(str(error))
         sys.exit(1 if isinstance(error, StudyError) else 2)
-    except BrokenPipeError:  # whoever read our output has gone, as `head` does
+    except BrokenPipeError:  # the reader of our output has stopped reading, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        remedy = "; make room, then `cconv study resume` goes on" if is_disk_full(error) else ""
+        remedy = "; make room, then continue with `cconv study resume`" if is_disk_full(error) else ""
         _print_refusal(f"{place}{error.strerror or str(error) or type(error).__name__}{remedy}")
         sys.exit(2)
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""How commands print: results on stdout, progress and errors on stderr."""
+"""The consoles of the commands: results go to stdout, progress and errors to stderr."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -14,8 +14,8 @@ from cconv.errors import visible
 class PlainConsole(Console):
     """A console that shows strings as they are, in tables and live displays too.
 
-    Names and reasons come from files of others. So no string is read as markup or an emoji's name, and control
-    characters are written as escapes; whoever wants a style gives a `Text`.
+    Names and reasons come from foreign files. So no string is read as markup or as the name of an emoji, and control
+    characters are written as escapes. To print with a style, pass a `Text`.
     """
 
     def __init__(self, **options: Any):
@@ -32,19 +32,19 @@ errors = PlainConsole(stderr=True)
 
 
 def plain_column(text: str) -> TextColumn:
-    """A column of a progress display whose fields are shown as they are."""
+    """Make a column of a progress display that shows its fields as they are."""
     return TextColumn(text, markup=False)
 
 
 def show_progress(items: Iterable, label: str) -> Iterator:
-    """The items, with a progress bar on stderr while that is a terminal."""
+    """Yield the items and show a progress bar on stderr if that is a terminal."""
     columns = (plain_column("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
         yield from progress.track(items, description=visible(label))
 
 
 def print_findings(findings: Iterable, console: Console = errors) -> None:
-    """A line for each thing in the data that does not make sense."""
+    """Print a line for each implausibility of the data."""
     for finding in findings:
         console.print(f"cconv: suspicious data: {finding}", style="yellow", soft_wrap=True)
 

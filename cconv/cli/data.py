@@ -26,19 +26,21 @@ DataFolder = Annotated[
         "DeepLagrangianFluids (*.msgpack.zst).",
     ),
 ]
-OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write; it appears when all is done.")]
+OutFolder = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Folder to write; it appears when it is complete.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an older data set in the folder.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of a table.")]
 Mass = Annotated[
     float | None,
-    typer.Option(help="Mass of every particle, where the data hold none or wrong ones (DeepLagrangianFluids: 0.125)."),
+    typer.Option(help="Mass of every particle, if the data store none or wrong ones (DeepLagrangianFluids: 0.125)."),
 ]
 Spacing = Annotated[
     float | None,
     typer.Option(help="Distance of neighbouring particles at rest; smoothing lengths scale with it."),
 ]
 FrameDt = Annotated[
-    float | None, typer.Option(help="Time between stored frames, where the data do not say it or say it wrong.")
+    float | None, typer.Option(help="Time between stored frames, if the data do not store it or store a wrong one.")
 ]
 Force = Annotated[
     str | None,
@@ -50,7 +52,7 @@ Force = Annotated[
 
 @app.command()
 def scenes(as_json: AsJson = False) -> None:
-    """List the scenes that `generate` makes, and what each has: walls, forces, a free surface ..."""
+    """List the scenes that `generate` can make, and their features: walls, forces, a free surface ..."""
     from cconv.scenes import SCENES, scene_named
 
     facts: list[dict] = [
@@ -96,24 +98,28 @@ def generate(
     ] = "published",
     trajectories: Annotated[
         int | None,
-        typer.Option(help="How many simulations, split 2:1:1; a single one is cut in time. The size's own by default."),
+        typer.Option(
+            help="Number of simulations, split 2:1:1; a single one is cut in time. The default depends on the size."
+        ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Frames of each, the start included. The size's own by default.")
+        int | None, typer.Option(help="Number of frames of each, the start included. The default depends on the size.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random starts; the same seed gives the same bytes.")] = 0,
-    workers: Annotated[int | None, typer.Option(help="Simulations side by side; as many as cores by default.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of simulations at the same time; by default one on each core.")
+    ] = None,
     particle_spacing: Spacing = None,
     viscosity: Annotated[float | None, typer.Option(help="Kinematic viscosity.")] = None,
     time_step: Annotated[
-        float | None, typer.Option(help="Step of the solver; refused where it breaks a CFL condition.")
+        float | None, typer.Option(help="Time step of the solver; an error if it violates a CFL condition.")
     ] = None,
-    steps_per_frame: Annotated[int | None, typer.Option(help="Steps of the solver between stored frames.")] = None,
+    steps_per_frame: Annotated[int | None, typer.Option(help="Number of solver steps between stored frames.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Make the data of a scene with the SPH solver, e.g. to train on or to try the rest of `cconv` with.
 
-    Finished simulations wait in DIR.unfinished until all are done: after a kill, the same command goes on from there.
+    Finished simulations are kept in DIR.unfinished until all are done; the same command continues after a kill.
     """
     from cconv.data.generate import generate as run
     from cconv.scenes import scene_named
@@ -131,7 +137,9 @@ def generate(
         progress=show_progress,
     )
     for failure in done.failures:
-        errors.print(f"cconv: replaced a start that blew up: {failure}", markup=False, highlight=False, soft_wrap=True)
+        errors.print(
+            f"cconv: replaced a simulation that blew up: {failure}", markup=False, highlight=False, soft_wrap=True
+        )
     resumed = f", {done.reused} of them from an earlier run" if done.reused else ""
     results.print(
         f"{trajectories or chosen.num_trajectories} trajectories{resumed}: {out}", soft_wrap=True, markup=False
@@ -143,18 +151,19 @@ def inspect(
     path: DataFolder,
     as_json: AsJson = False,
     cutoff: Annotated[
-        float | None, typer.Option(help="Radius within which neighbours are counted; twice the spacing if not given.")
+        float | None,
+        typer.Option(help="Radius within which neighbours are counted; twice the particle spacing by default."),
     ] = None,
     mass: Mass = None,
     particle_spacing: Spacing = None,
     frame_dt: FrameDt = None,
     force: Force = None,
 ) -> None:
-    """Show what a data set holds, what it lacks, what was taken instead, and what does not make sense.
+    """Show what a data set holds and lacks, which defaults replace missing facts, and what is implausible.
 
-    Every trajectory is read, so damaged files and exploded simulations are found here. What can be read but is no
-    simulation of a fluid is named with its frame and particle: masses of zero, frames never written, particles outside
-    the box or at the same place, a spacing that does not fit, axes that particles cross though they are not periodic.
+    The command reads every trajectory, so it finds damaged files and exploded simulations. It names the frame and the
+    particle of implausible data: masses of zero, frames never written, particles outside the box or at the same place,
+    a spacing that does not fit, axes that particles cross although they are not periodic.
     """
     from cconv.data.inspect import inspect_dataset
 
@@ -178,7 +187,7 @@ def convert(
 ) -> None:
     """Write a data set as LagrangeBench HDF5, with velocities, masses and wall points as extra members.
 
-    Splits become files. What is given here is stored, so it need not be given again.
+    Each split becomes a file. Values given here are stored with the data, so later commands do not need them.
     """
     from cconv.data.convert import convert as run
 
@@ -191,20 +200,25 @@ def show(
     path: DataFolder,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.png", help="Picture to write; the data folder's name.png here if not given."),
+        typer.Option(
+            metavar="FILE.png",
+            help="Picture to write; by default NAME.png in the working folder, NAME being the data folder.",
+        ),
     ] = None,
     split: Annotated[str, typer.Option(help="Split of the trajectory: train, valid or test.")] = "test",
     trajectory: Annotated[int, typer.Option(help="Number of the trajectory in its split, from 0.")] = 0,
     frames: Annotated[
         str | None,
-        typer.Option(metavar="K,K,...", help="Frames of the picture, from 0, e.g. 0,50,100; four evenly spaced else."),
+        typer.Option(
+            metavar="K,K,...", help="Frames of the picture, from 0, e.g. 0,50,100; by default four evenly spaced ones."
+        ),
     ] = None,
     color: Annotated[
         str,
         typer.Option(
             metavar="speed|density|type",
-            help="What colours show: speed; deviation of the SPH density from rest in percent (negative at a free "
-            "surface and beside thin walls, where particles are missing in the sum); or particle type.",
+            help="Quantity to colour by: speed; deviation of the SPH density from rest in percent (negative at a "
+            "free surface and beside thin walls, where the sum lacks particles); or particle type.",
         ),
     ] = "speed",
     animate: Annotated[
@@ -229,7 +243,7 @@ def show(
 ) -> None:
     """Draw frames of a trajectory side by side as PNG; animate them; export them for ParaView.
 
-    All frames of a file share one scale of colours; outliers are beyond its pointed ends.
+    All frames of a file share one colour scale. Outliers lie beyond its ends, which are drawn as arrows.
     """
     from cconv.data.splits import evenly_spaced
     from cconv.data.vtk import write_vtk
@@ -301,7 +315,7 @@ def _table(facts: dict) -> Table:
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for label, text in _rows(facts):
-        table.add_row(label, Text(text))  # names and sources are foreign: no markup in them
+        table.add_row(label, Text(text))  # names and sources come from the data: read no markup in them
     return table
 
 

@@ -1,4 +1,4 @@
-"""Progress of trials in the terminal: a live table, or plain lines where there is no terminal."""
+"""Progress of trials in the terminal: a live table, or plain lines without a terminal."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ class _Row:
 
 @dataclass
 class StudyDisplay:
-    """Shows the trials of a study as they run; an `Observer` of `cconv.study.running.observer`.
+    """Display of the trials of a study as they run; an `Observer` of `cconv.study.running.observer`.
 
     Attributes:
         console: Where to draw.
@@ -55,7 +55,7 @@ class StudyDisplay:
             self._live.stop()
 
     def on_data(self, findings: Sequence[str]) -> None:
-        """Print a line for everything that does not make sense."""
+        """Print a line for each implausibility of the data."""
         print_findings(findings, self.console)
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
@@ -118,11 +118,11 @@ class StudyDisplay:
 
 
 class TrainingBar:
-    """Progress of one training: updates, rate, loss, best error, time left; plain lines where there is no terminal.
+    """Progress of one training: updates, rate, loss, best error, time left; plain lines without a terminal.
 
     Args:
         console: Where to draw.
-        name: What to call the training.
+        name: Name of the training.
         updates: Its budget.
     """
 
@@ -146,7 +146,7 @@ class TrainingBar:
         self._progress.stop()
 
     def on_update(self, state: "TrainingState") -> None:
-        """Show how far the training has come."""
+        """Show the state of the training after an update."""
         valid = state.valid_error
         if valid is not None:
             self._best = valid if self._best is None else min(self._best, valid)

@@ -27,8 +27,8 @@ def train(
 ) -> None:
     """Train the network of a study file, without a search.
 
-    The file's tables task, network and training say what; without a table network it is the published ConvNet. The
-    checkpoint with the smallest validation error is in DIR/checkpoint, also after Ctrl-C.
+    The tables task, network and training of the file describe the training; without a table network, the published
+    ConvNet is trained. The checkpoint with the smallest validation error is in DIR/checkpoint, also after Ctrl-C.
     """
     from cconv.study.records.trials import TrialFolder
     from cconv.study.running.problem import provenance
@@ -63,13 +63,16 @@ def fit(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Checkpoint to write; it must not exist yet.")],
     data: DataPath = None,
     ridge: Annotated[
-        float, typer.Option(help="Weight of the squared coefficients, in mean squares of a term of the layer.")
+        float,
+        typer.Option(
+            help="Weight of the penalty on squared coefficients, relative to the mean square of a term of the layer."
+        ),
     ] = 1e-10,
     settings: Settings = None,
 ) -> None:
-    """Fit a single layer to a study's data by least squares: seconds, no training.
+    """Fit a single layer to the data of a study by least squares, in seconds and without training.
 
-    The file's table network says which layer, as in experiments/closed_form.toml: layers = 1, architecture =
+    The table network of the file describes the layer, as in experiments/closed_form.toml: layers = 1, architecture =
     "radial_net" or "conv_net", message, relative_cutoff, window. The checkpoint evaluates like a trained one
     (`cconv evaluate DIR`).
     """
@@ -107,7 +110,7 @@ def evaluate(
     data: DataPath = None,
     split: Annotated[str, typer.Option(help="Split to evaluate: train, valid or test.")] = "test",
     task: Annotated[
-        str | None, typer.Option(help="Task that the model must be for; an error if it is for another.")
+        str | None, typer.Option(help="Required task of the model; an error if the model is for another.")
     ] = None,
     mass: Mass = None,
     particle_spacing: Spacing = None,
@@ -118,8 +121,8 @@ def evaluate(
     """Report the error of a saved model on a split of a data set, by default the test split.
 
     A model works at any resolution, because it computes in particle spacings, rest densities and frame intervals.
-    Masses, spacing and time step are read from the data or given here; those in the checkpoint hold for the data that
-    it was trained on alone.
+    Masses, spacing and time step are read from the data or given here. Those in the checkpoint are only used for the
+    data that it was trained on.
     """
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
@@ -177,7 +180,7 @@ def _errors_on(model: "Model", progress: Iterable, samples: Sequence, training: 
 
 
 def _print_evaluation(facts: Mapping) -> None:
-    """What `evaluate` says to a reader: the error by both variances where they differ, and what knows nothing."""
+    """Print the error, the error relative to the variance of these data if it differs, and the mean predictor's."""
     mse, own, mean = (facts[name] for name in ("normalized_mse", "own_normalized_mse", "mean_predictor_normalized_mse"))
     lines = [
         f"{facts['split']}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {facts['frames']} frames "
@@ -195,7 +198,7 @@ def _print_evaluation(facts: Mapping) -> None:
 
 
 def report(path: RunPath) -> None:
-    """Write the report.html of a run again; it works for interrupted runs too."""
+    """Write report.html of a run again, also for an interrupted run."""
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report
@@ -203,7 +206,7 @@ def report(path: RunPath) -> None:
     from cconv.study.studies import recorded_space, recorded_study
 
     run = RunFolder.open(path)
-    recorded_study(run), recorded_space(run)  # whose every key the page may show
+    recorded_study(run), recorded_space(run)  # checks them, because the page may show every key
     try:
         written = write_report(run)
     except CConvError:
@@ -218,7 +221,7 @@ def report(path: RunPath) -> None:
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
-    """Settings, samples and data of a study whose single model goes to `out`, which must not exist yet."""
+    """Return settings, samples and data of a study whose single model is written to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
     from cconv.study.running.problem import load_problem, open_study_data, with_data_path
     from cconv.study.studies import load_study

@@ -1,4 +1,4 @@
-"""`cconv study`: run a study, go on with it, give it more trials, look at its state."""
+"""`cconv study`: run a study, continue it, add trials, show its state."""
 
 from operator import itemgetter
 from pathlib import Path
@@ -42,7 +42,7 @@ Address = Annotated[
         "--address",
         metavar="HOST:PORT",
         help="Train on the Ray cluster there ('auto' for one on this machine); the run folder must be on storage that "
-        "all nodes share. Without it a private Ray uses the cores of this machine.",
+        "all nodes share. By default a private Ray uses the cores of this machine.",
     ),
 ]
 Storage = Annotated[
@@ -50,7 +50,7 @@ Storage = Annotated[
     typer.Option(
         "--storage",
         metavar="URL",
-        help="Database of the Optuna study, e.g. postgresql+psycopg://USER@HOST/DATABASE; without it a journal file in "
+        help="Database of the Optuna study, e.g. postgresql+psycopg://USER@HOST/DATABASE; by default a journal file in "
         "the run folder.",
     ),
 ]
@@ -66,7 +66,9 @@ def run(
     data: DataPath = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Run folder to write; runs/NAME if not given, by the study's name."),
+        typer.Option(
+            "--out", metavar="DIR", help="Run folder to write; by default runs/NAME with the name of the study."
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an older run in the folder.")] = False,
     address: Address = None,
@@ -99,7 +101,7 @@ def run(
         _run_stages(folder, address, storage, serial)
     except CConvError:
         if not folder.trials():
-            folder.remove()  # nothing was learned, and the same command shall work once the input is mended
+            folder.remove()  # nothing was trained, so the same command works once the input is corrected
         raise
 
 
@@ -109,8 +111,8 @@ def resume(
 ) -> None:
     """Continue a study that was interrupted or killed.
 
-    Finished stages and finished trials are kept. Each other training continues from its last evaluation, and what ASHA
-    decided before stays decided.
+    Finished stages and finished trials are kept. Every other training continues from its last evaluation, and earlier
+    decisions of ASHA are kept.
     """
     from cconv.study.pipeline import move_data
     from cconv.study.records.run_folder import RunFolder
@@ -125,13 +127,13 @@ def resume(
 @app.command()
 def extend(
     path: RunPath,
-    stage: Annotated[str, typer.Option("--stage", help="Search to extend, by its name in the study file.")],
-    trials: Annotated[int, typer.Option("--trials", min=1, max=100_000, help="How many trials to add.")],
+    stage: Annotated[str, typer.Option("--stage", help="Search to extend: the name of its stage in the study file.")],
+    trials: Annotated[int, typer.Option("--trials", min=1, max=100_000, help="Number of trials to add.")],
     address: Address = None,
     serial: Serial = False,
     storage: Storage = None,
 ) -> None:
-    """Add trials to a search of a study, then rerun the stages that read it; trainings that exist are used again."""
+    """Add trials to a search of a study, then rerun the stages that read it; existing trainings are used again."""
     from cconv.study.pipeline import extend_study
     from cconv.study.records.run_folder import RunFolder
 
@@ -147,7 +149,7 @@ def _check_place(address: str | None, serial: bool) -> None:
 
 
 def _run_stages(folder: "RunFolder", address: str | None, storage: str | None, serial: bool) -> None:
-    """Run what is left of a study, write its report and print its answer."""
+    """Run the remaining stages of a study, write its report and print its answer."""
     from cconv.report.page import write_report
     from cconv.study.pipeline import run_study
 
@@ -157,7 +159,7 @@ def _run_stages(folder: "RunFolder", address: str | None, storage: str | None, s
         except KeyboardInterrupt:
             write_report(folder)
             errors.print(
-                f"\nInterrupted; everything so far is in {folder.path}. Go on with: cconv study resume {folder.path}",
+                f"\nInterrupted; everything so far is in {folder.path}. Resume: cconv study resume {folder.path}",
                 soft_wrap=True,
             )
             raise

@@ -1,4 +1,4 @@
-"""What a model costs: measured alone, with a fixed number of threads, always next to a reference in the same run."""
+"""The measured cost of a model: alone on the machine, with fixed threads, next to a reference in the same run."""
 
 import itertools
 import math
@@ -34,21 +34,21 @@ Call = Callable[[int], tuple[float, float]]
 class Cost:
     """Cost of predicting one frame as a user does, by `predict_frame`.
 
-    The time is that of everything from the particles of a stored frame to the field in the units of the data: features,
-    the sum of densities for models that take it, neighbour search, geometry and network.
+    The time covers everything from the particles of a stored frame to the field in the units of the data: features,
+    the sum of densities if the model takes it, neighbour search, geometry and network.
 
     Attributes:
         ms_per_frame: Median time of a frame, ms.
         ms_low: Lower quartile.
         ms_high: Upper quartile.
-        geometry_ms: Median time of all but the network: features, densities, neighbours, geometry.
+        geometry_ms: Median time of everything except the network: features, densities, neighbours, geometry.
         network_ms: Median time of the network alone.
-        turns_ms: Time of each turn, ms; the same turn of all models that were timed together had the same frame.
+        turns_ms: Time of each turn, ms; in the same turn all models that are timed together predict the same frame.
         us_per_particle: Median time over the number of fluid particles, µs.
-        peak_mb: Memory that predictions add to a fresh process at most, MB.
-        flops_per_particle: Multiplications and additions of one particle's prediction.
-        threads: Threads of the measurement.
-        num_particles: Fluid particles of the frame, mean.
+        peak_mb: Largest memory that predictions add to a fresh process, MB.
+        flops_per_particle: Multiplications and additions of a prediction per particle.
+        threads: Number of threads of the measurement.
+        num_particles: Mean number of fluid particles of a frame.
     """
 
     ms_per_frame: float
@@ -97,18 +97,18 @@ def measure_costs(
     threads: int,
     repeats: int,
 ) -> tuple[dict[str, Cost], AnalyticCost]:
-    """Cost of each model and of the analytic field on the same frames.
+    """Measure the cost of each model and of the analytic field on the same frames.
 
-    They take turns, so that a change of the machine's speed meets all of them alike, each turn in an order of its own;
-    one round is a warm-up.
+    They take turns, so that a change of the machine's speed affects all of them alike. Each turn has a random order,
+    and the first one is a warm-up.
 
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
         frames: Frames to predict, in turn.
         scene: Their scene.
-        task: Which analytic field.
-        threads: Torch threads.
+        task: Task that names the analytic field.
+        threads: Number of torch threads.
         repeats: Timed predictions of each model, at least 2.
     """
     loaded = {name: load(path) for name, path in models.items()}
@@ -135,14 +135,14 @@ def measure_costs(
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTime:
-    """Time of predicting a frame of some size.
+    """Time of predicting a frame of a given size.
 
     Attributes:
         num_particles: Fluid particles.
         ms_per_frame: Median time, ms.
         ms_low: Lower quartile.
         ms_high: Upper quartile.
-        geometry_ms: Median time of all but the network.
+        geometry_ms: Median time of everything except the network.
         network_ms: Median time of the network alone.
     """
 
@@ -156,11 +156,11 @@ class FrameTime:
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """How the time of a frame grows with the number of particles.
+    """Growth of the time of a frame with the number of particles.
 
     Attributes:
         times: Time at each size that was measured, ascending.
-        exponent: Slope of time over number in logarithms, by least squares; NaN from a single size.
+        exponent: Slope of log time against log number of particles, by least squares; NaN for a single size.
         left_out: Sizes that would have taken too long.
     """
 
@@ -179,7 +179,7 @@ def measure_growth(
     repeats: int,
     max_seconds: float = 3.0,
 ) -> dict[str, Growth]:
-    """Time of each model on blocks of fluid of growing size, with the particle spacing that the model is for.
+    """Time each model on blocks of fluid of growing size, with the particle spacing that the model was trained for.
 
     The models take turns; one round at each size is a warm-up. A model whose frame takes longer than `max_seconds` is
     not measured at larger sizes.
@@ -187,11 +187,11 @@ def measure_growth(
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
-        analytic: Field that is also summed analytically, in turn with the models, under the name `ANALYTIC`.
+        analytic: Configuration of the field that is also summed analytically in turn with the models, named `ANALYTIC`.
         sizes: Numbers of fluid particles, ascending.
-        threads: Torch threads.
+        threads: Number of torch threads.
         repeats: Timed predictions of each model and size, at least 2.
-        max_seconds: Longest median time of a frame after which a model goes on.
+        max_seconds: Largest median time of a frame after which a model is still timed at the next size.
     """
     callers = {name: partial(_block_call, load(path)) for name, path in models.items()}
     if analytic is not None:
@@ -213,11 +213,11 @@ def measure_growth(
 
 
 def fluid_block(num_particles: int, field: ModelConfig, seed: int = 0) -> tuple[Frame, Scene]:
-    """A cube of fluid in open space for a model: a jittered lattice with random velocities, on a layer of wall points.
+    """Make a cube of fluid in open space: a jittered lattice with random velocities, on a layer of wall points.
 
     Args:
-        num_particles: Fluid particles; the topmost layer of the cube is as full as they make it.
-        field: What the model is for: dimensions, particle spacing, features of boundary points.
+        num_particles: Number of fluid particles; the topmost layer of the cube may be incomplete.
+        field: Configuration of the model: dimensions, particle spacing, features of boundary points.
         seed: Seed of jitter and velocities.
     """
     dim, spacing = field.dim, field.particle_spacing
@@ -258,14 +258,14 @@ def _block_scene(field: ModelConfig, side: int) -> Scene:
 
 
 def flops_per_particle(model: Model, inputs: Inputs) -> float:
-    """Multiplications and additions of one particle's prediction, counted from settings for the given frame."""
+    """Count the multiplications and additions of a prediction per particle, from settings and a frame."""
     config = model.config
     around = neighbor_density(inputs, config.network.relative_cutoff)
     return config.network.count(config.inputs, config.walls, config.output, config.dim, around).flops_per_particle
 
 
 def neighbor_density(inputs: Inputs, relative_cutoff: float) -> NeighborDensity:
-    """Points around the particles of a frame, counted within a cutoff in particle spacings."""
+    """Count the points around the particles of a frame within a cutoff in particle spacings."""
     particles = max(inputs.num_particles, 1)
     counts = [len(radius_graph(inputs.positions, relative_cutoff, inputs.box)) / particles]
     if inputs.wall_positions is not None:
@@ -276,9 +276,9 @@ def neighbor_density(inputs: Inputs, relative_cutoff: float) -> NeighborDensity:
 
 
 def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tuple[float, float]]]:
-    """Times of geometry and network of each call, s; the first of its turns is left out.
+    """Time geometry and network of each call in turn, s, without the first turn.
 
-    Each turn has an order of its own, as a call leaves the caches to the next one.
+    The order of the calls changes in each turn, because a call inherits the caches of the one before it.
     """
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     orders = random.Random(0)
@@ -309,7 +309,7 @@ def _analytic_block_call(field: ModelConfig, size: int) -> Call:
 
 
 def _time_prediction(model: Model, frame: Frame, scene: Scene) -> tuple[float, float]:
-    """Time of `predict_frame` outside of the network and within it."""
+    """Time `predict_frame` outside the network and inside it."""
     marks = []
     hooks = [
         model.network.register_forward_pre_hook(lambda *_: marks.append(time.perf_counter())),
@@ -325,7 +325,7 @@ def _time_prediction(model: Model, frame: Frame, scene: Scene) -> tuple[float, f
 
 
 def _time_analytic(task: FieldTask, sums: CompiledSums, frame: Frame, scene: Scene) -> tuple[float, float]:
-    """Time of the neighbour search, fluid picked out of the frame, and of the sums."""
+    """Time the neighbour search, including the selection of the fluid, and the sums."""
     start = time.perf_counter()
     fluid = frame.particle_types == ParticleType.FLUID
     masses, positions, velocities = (values[fluid] for values in (frame.masses, frame.positions, frame.velocities))
@@ -345,7 +345,7 @@ def _turns(times: Sequence[tuple[float, float]]) -> tuple[float, ...]:
 
 
 def _medians(times: Sequence[tuple[float, float]]) -> dict[str, float]:
-    """Times of frames with their quartiles, ms, by their names in `Cost` and `FrameTime`."""
+    """Summarise times as medians and quartiles, ms, by their names in `Cost` and `FrameTime`."""
     low, median, high = statistics.quantiles(_turns(times), n=4, method="inclusive")
     return {
         "ms_per_frame": median,

@@ -1,10 +1,10 @@
-r"""What a model has learned: its field beside the analytic one, the spread of its errors, its filters beside ∇W.
+r"""Explanation of what a model has learned: its field, the distribution of its errors, and its filters beside ∇W.
 
-The filters of the first layer are probed, not read: pairs of particles lie far apart from all others, one feature of
-the sending particle is raised by one unit, and the answer at the receiving particle is the filter at
+The filters of the first layer are measured: pairs of particles lie far apart from all others, one feature of the
+sending particle is raised by one unit, and the output at the receiving particle is the filter at
 :math:`d = x_j - x_i`. The same pairs probe the analytic operators, whose filters are :math:`m \nabla W(d)` for the
 density rate (D2) and :math:`-m \nabla W(d) / \rho_i` for the density gradient (D3). So interpolation, windows, maps and
-radial terms count exactly as they do in a prediction.
+radial terms act exactly as in a prediction.
 """
 
 import math
@@ -33,7 +33,7 @@ _POINTS_ON_LINE, _RADII, _BINS_PER_DECADE = 161, 80, 5
 
 @torch.no_grad()
 def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
-    """Fields and first-layer filters of a model on one frame; arrays that `np.savez` holds and `np.load` reads.
+    """Compute fields and first-layer filters of a model on one frame, as arrays for `np.savez`.
 
     Args:
         model: The model.
@@ -41,8 +41,8 @@ def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
 
     Returns:
         "particle_spacing"; "positions" (N, D), "target" and "prediction" (N, C), in the units of the data;
-        "error" (N,), squared, by the variance of the target over training; and what `first_layer_filters` returns,
-        where the network is one of convolutions.
+        "error" (N,), squared error ÷ variance of the target over training; and the arrays of `first_layer_filters`, if
+        the network is one of convolutions.
     """
     is_convolutional = isinstance(model.network, ConvolutionNetwork)
     spacing = sample.inputs.units.length
@@ -58,14 +58,14 @@ def explain(model: Model, sample: Sample) -> dict[str, np.ndarray]:
 
 @torch.no_grad()
 def error_distribution(model: Model, samples: Iterable[Sample]) -> dict[str, np.ndarray]:
-    """How the errors of single particles are spread.
+    """Compute the distribution of the errors of single particles.
 
-    An error is the root mean square over the components of prediction - target, by the standard deviation of the target
-    over training.
+    An error is the root mean square over the components of prediction - target, divided by the standard deviation of
+    the target over training.
 
     Returns:
-        "error_bins" (B + 1,), logarithmic; "error_counts" (B,), particles in each, the first and last bin hold all that
-        lie beyond; "error_levels" and "error_quantiles", the quantiles of these levels.
+        "error_bins" (B + 1,), logarithmic; "error_counts" (B,), particles in each, where the first and last bin include
+        all beyond; "error_levels", and "error_quantiles" at these levels.
     """
     errors = torch.cat([_relative_errors(model, sample) for sample in samples]).numpy()
     bins = np.logspace(-8, 3, 11 * _BINS_PER_DECADE + 1)
@@ -81,10 +81,10 @@ def error_distribution(model: Model, samples: Iterable[Sample]) -> dict[str, np.
 
 @torch.no_grad()
 def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
-    """Learned filters of the fluid's first layer beside the analytic ones, of a network of convolutions.
+    """Measure the filters of the first fluid convolution and the analytic ones, for a network of convolutions.
 
-    A network of one layer is compared as it is. The outputs of a deeper one have no meaning of their own: its filters
-    are combined linearly so that they come as near to the analytic ones as they can, by least squares over the ball.
+    The filters of a single-layer network are compared directly. The first outputs of a deeper one have no meaning of
+    their own, so its filters are combined linearly to be closest to the analytic ones, by least squares over the ball.
 
     Returns:
         "feature_names" (F,); "is_combined", whether the network has several layers; "unexplained", the squared
@@ -92,7 +92,7 @@ def first_layer_filters(model: Model, sample: Sample) -> dict[str, np.ndarray]:
         "cutoff" and "support", the radii of the filters and of W; "line" (L,), offsets through the centre;
         "learned_on_axes" and "analytic_on_axes" (D, L, F, C), filters of each feature and component along each axis;
         "radii" (K,), "learned_radial" (K,), "learned_radial_low" and "learned_radial_high" (K,), the part along d/r
-        averaged over directions and what nine of ten directions keep; "analytic_radial" (K,).
+        averaged over directions, and the range of nine of ten directions; "analytic_radial" (K,).
     """
     pairs = _probing_pairs(model)
     analytic = _analytic_filters(model, sample, pairs)
@@ -129,11 +129,11 @@ class _Pairs:
 
     Attributes:
         displacements: (P, D).
-        ball: Which of them belong to the ball, (P,).
+        ball: Mask of those that belong to the ball, (P,).
         line: Offsets along an axis, (L,).
         radii: Distances in the ball, (K,); each has the same directions.
-        volume: Weight of each point of the ball, as the volume that it stands for.
-        spacing: Distance between two pairs, beyond which neither filters nor W reach.
+        volume: Weight of each point of the ball, the volume that it represents.
+        spacing: Distance between two pairs, larger than the radii of filters and W.
     """
 
     displacements: Tensor
@@ -183,7 +183,7 @@ def _directions(dim: int) -> Tensor:
 
 
 def _learned_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
-    """Answers of the first convolution (P, F, C_out), by unit of each feature, without bias."""
+    """Measure the outputs of the first convolution per unit of each feature (P, F, C_out), without bias."""
     twin, given = deepcopy(model).double(), sample.inputs
     (network, _), (_, settings) = _convolutions(twin), _convolutions(model)
     twin.settings = settings.model_copy(update={"normalize": False})
@@ -200,7 +200,7 @@ def _learned_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
 
 
 def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
-    """Answers of the analytic operator (P, F, C), by unit of each feature, for the frame's mass and mean density."""
+    """Measure the outputs of the analytic operator per unit of each feature (P, F, C), for mean density and mass."""
     inputs, kernel = sample.inputs.double(), model.kernel_at(1.0)
     densities = _named(inputs.features, DENSITY)
     edges = radius_graph(inputs.positions, kernel.support_radius, inputs.box)
@@ -254,7 +254,7 @@ def _raised(rest: Tensor) -> list[Tensor]:
 
 
 def _filter_units(sample: Sample) -> Tensor:
-    """What filters of each feature are multiples of, in the units of the data, (F, 1)."""
+    """Return the unit of the filters of each feature, in the units of the data, (F, 1)."""
     units, features = sample.inputs.units, sample.inputs.features
     of_name = {DENSITY: units.density, VELOCITY: units.velocity}
     scalars = [of_name.get(name, 1.0) for name in features.scalar_names]
@@ -263,7 +263,7 @@ def _filter_units(sample: Sample) -> Tensor:
 
 
 def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
-    """The pairs as inputs with features (2P, F); where the frame has walls, no point of them is left."""
+    """Return the pairs as inputs with features (2P, F), without any wall points."""
     walls = like.wall_features
     none = None if walls is None else replace(walls, scalars=walls.scalars[:0], vectors=walls.vectors[:0])
     return Inputs(
@@ -277,7 +277,7 @@ def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
 
 
 def _convolutions(model: Model) -> tuple[ConvolutionNetwork, ConvolutionSettings]:
-    """The network and its settings, of a model whose filters are probed."""
+    """Return the network and its settings, of a model whose filters are measured."""
     network, settings = model.network, model.settings
     if not (isinstance(network, ConvolutionNetwork) and isinstance(settings, ConvolutionSettings)):
         raise ConfigError(f"`architecture` must be one of convolutions to have filters, got {settings.architecture!r}.")
@@ -289,7 +289,7 @@ def _has_several_layers(model: Model) -> bool:
 
 
 def _mean_window_sum(settings: ConvolutionSettings, sample: Sample) -> Tensor:
-    """Mean over particles of ψ, by which normalised filters are divided."""
+    """Average ψ, the divisor of normalised filters, over the particles."""
     edges = radius_graph(sample.inputs.positions.double(), settings.relative_cutoff, sample.inputs.box)
     values = window_values((edges.distances / edges.cutoff) ** 2, settings.window)
     return values.sum() / edges.num_receivers
@@ -311,7 +311,7 @@ def _unexplained(learned: Tensor, analytic: Tensor, volume: Tensor) -> Tensor:
 
 
 def _read_features(analytic: Tensor) -> Tensor:
-    """Which features the analytic operator reads, (F,)."""
+    """Return a mask of the features that the analytic operator reads, (F,)."""
     return analytic.abs().amax(dim=(0, 2)) > 0
 
 
@@ -330,7 +330,7 @@ def _on_axes(filters: Tensor, pairs: _Pairs) -> Tensor:
 
 
 def _along_direction(filters: Tensor, pairs: _Pairs, features: Features, read: Collection[str]) -> Tensor:
-    """The part along d/r of filters (P, F, C) by distance (K, M): of the density if it is read, else of velocities."""
+    """Return the part along d/r of filters (P, F, C) by distance (K, M), for the density if read, else velocities."""
     displacements = pairs.displacements[pairs.ball]
     directions = displacements / displacements.norm(dim=1, keepdim=True)
     answers = filters[pairs.ball]
@@ -342,6 +342,6 @@ def _along_direction(filters: Tensor, pairs: _Pairs, features: Features, read: C
 
 
 def _relative_errors(model: Model, sample: Sample) -> Tensor:
-    """Root mean square of each particle's error over the components, by the standard deviation of the target, (N,)."""
+    """Return the root mean square error of each particle ÷ standard deviation of the target, (N,)."""
     prediction = model(sample.inputs, model.geometry(sample.inputs))
     return (prediction - model.standardize_target(sample.target)).double().square().mean(dim=1).sqrt()

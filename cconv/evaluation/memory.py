@@ -1,4 +1,4 @@
-"""How much memory a prediction takes, measured in processes of their own."""
+"""Memory of a prediction, measured in a separate process for each model."""
 
 import resource
 from collections.abc import Callable, Mapping
@@ -18,14 +18,14 @@ Load = Callable[[Path], Model]
 def peak_megabytes(
     load: Load, models: Mapping[str, Path], frame: Frame, scene: Scene, threads: int
 ) -> dict[str, float]:
-    """Growth of the peak memory of a fresh process by two predictions of each model, MB.
+    """Measure how much two predictions of each model add to the peak memory of a fresh process, MB.
 
     Args:
         load: Reads a checkpoint folder.
         models: Checkpoint folder of each model.
         frame: Frame to predict.
         scene: Its scene.
-        threads: Torch threads.
+        threads: Number of torch threads.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         found = pool.submit(_of_each, load, tuple(models.values()), frame, scene, threads).result()
@@ -33,13 +33,13 @@ def peak_megabytes(
 
 
 def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame, scene: Scene, threads: int) -> list[float]:
-    """One process after another for each model, forked from this one, so that imports are paid for once."""
+    """Run one process after another, one for each model, forked from this one so that imports happen once."""
     context, found = get_context("fork"), []
     for path in paths:
         receiver, sender = context.Pipe(duplex=False)
         child = context.Process(target=_send_growth, args=(sender, load, path, frame, scene, threads))
         child.start()
-        sender.close()  # so that a child that dies is an end of file here
+        sender.close()  # so that the death of a child ends the file here
         found.append(receiver.recv())
         child.join()
     return found
@@ -55,7 +55,7 @@ def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame, scene
 
 
 def _peak_resident_megabytes() -> float:
-    """Peak memory of this process. On Linux `getrusage` would hand on the parent's peak, so /proc is asked."""
+    """Return the peak memory of this process; on Linux from /proc, as `getrusage` would return the parent's peak."""
     status = Path("/proc/self/status")
     if not status.is_file():
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

@@ -1,4 +1,4 @@
-"""Measures made of the errors of single frames: by other variances, by the thesis's measure, by blocks of time."""
+"""Measures from the errors of single frames: with other variances, the thesis's measure, in blocks of time."""
 
 from collections.abc import Iterable, Sequence
 
@@ -11,31 +11,31 @@ from cconv.tasks.samples import Sample
 
 
 def own_variance(model: Model, samples: Iterable[Sample]) -> float:
-    """Variance of the target over samples / that over the training split of a model.
+    """Return variance of the target over samples ÷ variance over the training split of a model.
 
-    An error divided by it is one by the variance of these samples: 1 is predicting their own mean.
+    A normalized MSE divided by it is relative to the variance of these samples: predicting their own mean scores 1.
     """
     targets = standardize_values(model.standardize_target(sample.target) for sample in samples)
     return float(targets.scale[0] ** 2)
 
 
 def per_frame_normalized_mse(errors: Sequence[FrameError]) -> float | None:
-    """Mean over frames of the error z-scored by each frame's own target; only to compare with the thesis.
+    """Average over frames the error divided by each frame's own variance, only to compare with the thesis.
 
-    Frames with a constant target do not count; None if there are no others.
+    Frames with a constant target are ignored; None if there are no others.
     """
     defined = [error.per_frame_normalized_mse for error in errors if error.per_frame_normalized_mse is not None]
     return float(np.mean(defined)) if defined else None
 
 
 def blocks_of_errors(errors: Sequence[FrameError], frames_per_block: int) -> np.ndarray:
-    """Errors averaged over the units that an interval resamples: trajectories, or blocks of frames of a single one.
+    """Average the errors over the units of an interval: trajectories, or blocks of frames of a single one.
 
-    Neighbouring frames are alike, so single frames would make an interval too narrow.
+    Neighbouring frames are similar, so with single frames as units an interval would be too narrow.
 
     Args:
         errors: Errors of the frames of a split, in order.
-        frames_per_block: Frames of a block, nearly, where there is only one trajectory; blocks are alike in length.
+        frames_per_block: Approximate length of the blocks if there is one trajectory; all have nearly the same length.
 
     Returns:
         Mean error of each unit, (units,).

@@ -1,4 +1,4 @@
-"""Objectives: what the models of a task are compared by, in the search, among finalists and in the test."""
+"""Objectives: the error that compares the models of a task in the search, among finalists and in the test."""
 
 import math
 from abc import ABC, abstractmethod
@@ -34,10 +34,10 @@ class Objective(ABC):
     """An error that models are compared by.
 
     Attributes:
-        name: Name by which tasks ask for it.
-        label: What charts and messages call it.
-        meaning: What it is, in sentences for readers.
-        measures: What else is measured beside it: the name of each measure, and what it is, in a sentence.
+        name: Name by which tasks refer to it.
+        label: Name in charts and messages.
+        meaning: Explanation in sentences for readers.
+        measures: Further measures: the name of each, and its explanation in a sentence.
     """
 
     name: ClassVar[str]
@@ -52,7 +52,7 @@ class Objective(ABC):
         Args:
             model: The model.
             samples: Frames with targets.
-            geometry: Sample to geometry, e.g. a cache; by default computed afresh.
+            geometry: Function from a sample to its geometry, e.g. a cache; by default it is computed anew.
         """
 
     @abstractmethod
@@ -62,20 +62,20 @@ class Objective(ABC):
         Args:
             model: The model.
             samples: Frames of the split, in order.
-            frames_per_block: Frames of a unit where the split has a single trajectory.
+            frames_per_block: Frames of a unit if the split has a single trajectory.
         """
 
     @abstractmethod
     def in_words(self, error: float) -> str:
-        """What an error means, as the end of a sentence."""
+        """Explain the size of an error, as the end of a sentence."""
 
     @abstractmethod
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
-        """What a model must be below to know anything: the error of predicting the mean of the training split."""
+        """Return the error of predicting the mean of the training split; a useful model is well below it."""
 
 
 class NormalizedMSE(Objective):
-    """Mean squared error over a split by the variance of the target over the training split."""
+    """Mean squared error over a split ÷ variance of the target over the training split."""
 
     name = "normalized_mse"
     label = "normalized MSE"
@@ -104,13 +104,13 @@ class NormalizedMSE(Objective):
         )
 
     def in_words(self, error: float) -> str:
-        """The error of a typical particle as a share of the spread of the target."""
+        """Express the error of a typical particle as a share of the spread of the target."""
         return (
             f"a typical error of {100 * math.sqrt(error):.3g} % of the spread of the true values in the training data"
         )
 
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
-        """Error of predicting the training mean: 1 on the training split, more where the data move more."""
+        """Return the error of predicting the training mean: 1 on the training split, more where the data vary more."""
         return normalized_mse(mean_predictor_error(samples, train_samples))
 
 
@@ -118,5 +118,5 @@ OBJECTIVES: dict[str, Objective] = {objective.name: objective() for objective in
 
 
 def objective_of(task: FieldTask) -> Objective:
-    """The objective that a task names."""
+    """Return the objective that a task names."""
     return OBJECTIVES[task.objective]

@@ -1,4 +1,4 @@
-"""How far a rollout is off: positions, kinetic energy and momentum, frame by frame."""
+"""Errors of a rollout frame by frame: positions, kinetic energy and momentum."""
 
 import torch
 from torch import Tensor
@@ -42,7 +42,7 @@ def kinetic_energies(positions: Tensor, box: Box, particle_spacing: float, frame
 
 
 def momentum_drift(positions: Tensor, masses: Tensor, box: Box) -> Tensor:
-    r"""Change of the momentum since the first two frames by the first sum of magnitudes, (T - 1,), float64.
+    r"""Change of the momentum since the start ÷ sum of the initial magnitudes, (T - 1,), float64.
 
     .. math:: \Big|\sum_i m_i (v_i^k - v_i^0)\Big| \Big/ \sum_i m_i |v_i^0|
 

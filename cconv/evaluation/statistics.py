@@ -1,6 +1,6 @@
-r"""Intervals of errors that were measured on several seeds and units: of a mean error, and of the ratio of two models.
+r"""Confidence intervals of errors over several seeds and units: of a mean error, and of the ratio of two models.
 
-A unit is what varies beside seeds: a trajectory, or a block of frames. Seeds and units are crossed, so the cells of one
+A unit is a trajectory, or a block of frames of a single one. Seeds and units are crossed, so the cells of one
 row or column are not independent draws. Errors are positive and span decades; the intervals hold for logarithms that
 are normal, with an effect of the seed, one of the unit, and one of both. tests/evaluation/test_coverage.py simulates
 how often each of them holds the true value.
@@ -17,20 +17,20 @@ from cconv.errors import ConfigError, DataError, ShapeError
 
 RESOLUTION = 0.05  # relative difference of two times that is too small to choose a model by
 
-FEWEST = 4  # seeds or units from which an interval is given
-SMALLEST_ERROR = 1e-14  # of the variance: the square of what float32 resolves; what lies below counts as that
+FEWEST = 4  # smallest number of seeds or units with an interval
+SMALLEST_ERROR = 1e-14  # share of the variance: the square of the resolution of float32; smaller errors count as this
 _DRAWS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairedRatio:
-    """How many times as large the errors of one model are as those of a reference, seed by seed and unit by unit.
+    """Ratio of the errors of one model to those of a reference, paired by seed and unit.
 
     Attributes:
         ratio: Geometric mean of the ratios of errors.
         log_ratio: Its natural logarithm.
-        log_standard_error: Standard error of `log_ratio` over seeds and units; 0 where only one number is known.
-        ci95: 95 % interval of `ratio` over other seeds and units; None where `why_no_interval` has a reason.
+        log_standard_error: Standard error of `log_ratio` over seeds and units; 0 if there is only one value.
+        ci95: 95 % interval of `ratio` over other seeds and units; None if `why_no_interval` has a reason.
     """
 
     ratio: float
@@ -40,10 +40,10 @@ class PairedRatio:
 
 
 def why_no_interval(seeds: int, units: int) -> str:
-    """The reason why no 95 % interval covers what it says with so few draws, or "".
+    """Return the reason why so few draws give no reliable 95 % interval, or "".
 
     With fewer than `FEWEST` units, or two or three seeds, the simulated intervals of every kind that was tried cover 48
-    to 93 %, or reach over many decades. A single seed is no draw: the interval then is that of this one fit.
+    to 93 %, or span many decades. A single seed means one fit, whose interval covers the units only.
 
     Args:
         seeds: Number of seeds; 1 for a closed form.
@@ -58,21 +58,21 @@ def why_no_interval(seeds: int, units: int) -> str:
 
 
 def crossed_interval(errors: np.ndarray, *, seed: int = 0) -> tuple[float, float] | None:
-    r"""95 % interval of a model's mean error over all seeds and units that could have been drawn.
+    r"""Compute the 95 % interval of a model's mean error over all possible seeds and units.
 
     It is a generalised confidence interval: the effects of seed a, unit b and both c of the logarithms are normal, the
     mean is :math:`\exp(\mu + (\sigma_a^2 + \sigma_b^2 + \sigma_c^2) / 2)`, and the unknown variances are what the sums
-    of squares of the table leave possible, :math:`SS / \chi^2`. The upper end of few units is far up: they do not rule
-    out that others are much harder. Sources: Weerahandi, "Generalized Confidence Intervals", JASA 88 (1993);
+    of squares of the table leave possible, :math:`SS / \chi^2`. The upper end is large with few units, because other
+    units may be much harder. Sources: Weerahandi, "Generalized Confidence Intervals", JASA 88 (1993);
     Krishnamoorthy and Mathew, "Inferences on the means of lognormal distributions using generalized p-values and
     generalized confidence intervals", J. Statistical Planning and Inference 115 (2003).
 
     Args:
-        errors: Errors (seeds, units), positive; one row where no seed is drawn.
+        errors: Errors (seeds, units), positive; one row for a model without seeds.
         seed: Seed of the draws.
 
     Returns:
-        Lower and upper end; None where `why_no_interval` has a reason.
+        Lower and upper end; None if `why_no_interval` has a reason.
 
     Raises:
         ShapeError: If `errors` is no table.
@@ -96,11 +96,11 @@ def crossed_interval(errors: np.ndarray, *, seed: int = 0) -> tuple[float, float
 def paired_ratio(ours: np.ndarray, reference: np.ndarray) -> PairedRatio:
     """Compare the errors of a model with those of a reference on the same seeds and units.
 
-    What a unit does to both models alike drops out of the ratio. The interval is that of Student's t on the logarithms,
-    with the standard error and degrees of freedom of `crossed_standard_error`.
+    Effects of a unit on both models cancel in the ratio. The interval is Student's t on the logarithms, with
+    the standard error and degrees of freedom of `crossed_standard_error`.
 
     Args:
-        ours: Errors (seeds, units); one row, which counts for every seed, where no seed is drawn.
+        ours: Errors (seeds, units); a model without seeds has one row, which counts for every seed.
         reference: Errors of the reference, likewise, with the same units.
 
     Raises:
@@ -119,7 +119,7 @@ def paired_ratio(ours: np.ndarray, reference: np.ndarray) -> PairedRatio:
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float] | None:
-    """95 % interval of the mean of a table (seeds, units) of normal values, by Student's t; None for too few draws."""
+    """Compute the 95 % interval of the mean of a normal table (seeds, units) by Student's t; None for too few draws."""
     if why_no_interval(*values.shape):
         return None
     error, freedom = crossed_standard_error(values)
@@ -149,7 +149,7 @@ def crossed_standard_error(values: np.ndarray) -> tuple[float, float]:
 
 
 def paired_logarithms(tables: list[np.ndarray]) -> list[np.ndarray]:
-    """Natural logarithms of tables of errors (seeds, units), those of one row repeated to the seeds of the others.
+    """Take logarithms of tables of errors (seeds, units), and repeat tables of one row for the seeds of the others.
 
     Raises:
         ShapeError: If they differ in their units or seeds.
@@ -183,18 +183,18 @@ def _sums_of_squares(table: np.ndarray) -> tuple[float, float, float]:
 
 
 def times_tie(ours: Sequence[float], other: Sequence[float]) -> bool:
-    """Whether the times of two models, measured in turn, do not differ beyond their noise.
+    """Tell whether the times of two models, measured in turn, are equal within their noise.
 
     A sign test on paired turns: the 95 % interval of the median ratio of the two times in a turn, from order statistics
-    by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must reach 1, or come
-    closer to it than is worth a choice (`RESOLUTION`). Fewer than six turns tell nothing apart.
+    by the binomial distribution (Conover, Practical Nonparametric Statistics, 1999, section 3.2), must include 1 or
+    come closer to it than `RESOLUTION`. With fewer than six turns all times tie.
 
     Args:
         ours: Time of each turn, such as `Cost.turns_ms`.
         other: Times of the other model in the same turns.
 
     Raises:
-        ConfigError: If the turns are not as many.
+        ConfigError: If the numbers of turns differ.
     """
     if len(ours) != len(other):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Time of a prediction from its counted cost, fitted to measured models, and how far such a prediction is off."""
+"""A model of the time of a prediction from its counted cost, fitted to measured models, with its errors."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -28,11 +28,11 @@ class TimeModel:
 
     @classmethod
     def fit(cls, estimates: Sequence[CountedCost], times: Sequence[float]) -> "TimeModel":
-        """The coefficients, none negative, with the smallest squared relative errors.
+        """Fit non-negative coefficients with the smallest squared relative errors.
 
         Args:
             estimates: Counted costs of measured models.
-            times: Their times, µs a particle, positive.
+            times: Their times, µs per particle, positive.
         """
         terms = np.array([_terms(each) for each in estimates]) / np.array(times)[:, None]
         scales = np.linalg.norm(terms, axis=0)
@@ -42,7 +42,7 @@ class TimeModel:
         return cls(us_per_particle=constant, us_per_flop=of_flops, us_per_byte=of_bytes)
 
     def predict(self, estimate: CountedCost) -> float:
-        """Time of one particle's prediction, µs."""
+        """Return the time of a prediction per particle, µs."""
         return float(np.dot(_terms(estimate), (self.us_per_particle, self.us_per_flop, self.us_per_byte)))
 
 
@@ -52,8 +52,8 @@ class CostModelCheck:
 
     Attributes:
         time_model: Fitted to all models.
-        measured: Time of each model, µs a particle.
-        predicted: Time of each model by coefficients that were fitted to the others, µs a particle.
+        measured: Time of each model, µs per particle.
+        predicted: Time of each model by coefficients that were fitted to the others, µs per particle.
         relative_errors: Predicted over measured, minus 1.
         median_relative_error: Median of their absolute values.
         rank_correlation: Spearman's, of predicted with measured times.
@@ -68,11 +68,11 @@ class CostModelCheck:
 
 
 def check_cost_model(estimates: Mapping[str, CountedCost], measured: Mapping[str, float]) -> CostModelCheck:
-    """How well times follow from counted costs: each model is predicted from the others.
+    """Measure how well times follow from counted costs by leave-one-out: each model is predicted from the others.
 
     Args:
         estimates: Counted cost of each model.
-        measured: Its time, µs a particle, in one run.
+        measured: Its time, µs per particle, in one run.
 
     Raises:
         ConfigError: If the names differ, or there are fewer than five models.

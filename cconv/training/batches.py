@@ -7,12 +7,12 @@ import numpy as np
 
 
 def epoch_order(num_samples: int, data_seed: int, epoch: int) -> np.ndarray:
-    """Order of the samples in an epoch, a permutation of ``range(num_samples)``."""
+    """Return the order of the samples in an epoch, a permutation of ``range(num_samples)``."""
     return np.random.default_rng([data_seed, epoch]).permutation(num_samples)
 
 
 def batches(num_samples: int, batch_size: int, data_seed: int) -> Iterator[list[int]]:
-    """Endless batches of sample indices; an epoch ends with a smaller batch where sizes do not divide."""
+    """Yield batches of sample indices without end; the last batch of an epoch may be smaller."""
     for epoch in count():
         order = epoch_order(num_samples, data_seed, epoch).tolist()
         for start in range(0, num_samples, batch_size):

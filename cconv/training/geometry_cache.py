@@ -1,4 +1,4 @@
-"""Geometries of frames that are seen again, kept up to a number of bytes."""
+"""A cache of the geometries of frames, with a limited memory."""
 
 from collections.abc import Callable
 
@@ -7,13 +7,14 @@ from cconv.tasks.samples import Sample
 
 
 class GeometryCache:
-    """Builds the geometry of a sample, and keeps those that come first until the memory is used up.
+    """A cache that builds the geometry of a sample, and keeps the first ones until its memory is full.
 
-    Samples come round once an epoch in a new order, so an eviction would only throw out what comes next.
+    Nothing is evicted, because every sample returns once in each epoch: an eviction would only replace one useful
+    geometry by another.
 
     Args:
-        build: Inputs of a frame to its geometry.
-        max_bytes: Memory to use at most.
+        build: Function from the inputs of a frame to its geometry.
+        max_bytes: Largest memory to use.
     """
 
     def __init__(self, build: Callable[..., FrameGeometry], max_bytes: int):
@@ -22,7 +23,7 @@ class GeometryCache:
         self._kept: dict[tuple[str, int], FrameGeometry] = {}
 
     def __call__(self, sample: Sample) -> FrameGeometry:
-        """Geometry of `sample`."""
+        """Return the geometry of a sample."""
         key = (sample.trajectory, sample.frame)
         if key in self._kept:
             return self._kept[key]

@@ -25,14 +25,14 @@ SCHEDULES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Optimization:
-    """Budget and optimiser of a training.
+    """Budget and settings of the optimiser of a training.
 
     Attributes:
-        updates: Gradient updates in all.
+        updates: Number of gradient updates.
         evaluate_every: Updates between evaluations; the last update is always evaluated.
         batch_size: Frames of an update.
         learning_rate: Initial learning rate of Adam.
-        schedule: "constant", "cosine" or "exponential"; the latter two fall to 1 %.
+        schedule: "constant", "cosine" or "exponential"; the last two fall to 1 % of the initial rate.
     """
 
     updates: int
@@ -42,25 +42,25 @@ class Optimization:
     schedule: str = "cosine"
 
     def rate_at(self, update: int) -> float:
-        """Learning rate of an update, counted from 1."""
+        """Return the learning rate of an update, counted from 1."""
         return self.learning_rate * SCHEDULES[self.schedule]((update - 1) / self.updates)
 
     def is_evaluated(self, update: int) -> bool:
-        """Whether an evaluation follows an update."""
+        """Tell whether an evaluation follows an update."""
         return update % self.evaluate_every == 0 or update == self.updates
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingState:
-    """Where training stands after a gradient update.
+    """State of a training after a gradient update.
 
     Attributes:
         updates: Gradient updates done.
         train_loss: Mean squared error of standardised targets in this update's batch.
         learning_rate: Learning rate of this update.
-        valid_error: Validation error, where this update was followed by an evaluation, else None.
+        valid_error: Validation error if an evaluation followed this update, else None.
         seconds: Time since training began, evaluations included.
-        diverged: Whether a loss or validation error was not finite; training ends there.
+        diverged: Whether a loss or validation error was not finite, which ends the training.
     """
 
     updates: int
@@ -81,17 +81,17 @@ def train(
     cache_bytes: int = 2**31,
     progress: Progress | None = None,
 ) -> Iterator[TrainingState]:
-    """Train `model` in place; yields after every update, so that the caller decides when to stop and what to keep.
+    """Train `model` in place; yield after every update, so that the caller decides when to stop and what to keep.
 
     Args:
         model: Model to train.
         samples: Frames to learn from.
-        valid_error: Validation error of the model, given a cache of geometries.
+        valid_error: Function from a cache of geometries to the validation error of the model.
         optimization: Budget and optimiser.
         data_seed: Seed of the batch order.
-        cache_bytes: Memory for the geometries of frames, at most.
-        progress: Where an earlier training of the same model and settings stands, from where it goes on as if it had
-            not been interrupted; moved on in place. None begins.
+        cache_bytes: Largest memory for the geometries of frames.
+        progress: Progress of an earlier training with the same model and settings, which continues as if it had not
+            been interrupted; it is updated in place. None begins a new training.
 
     Raises:
         ConfigError: If the schedule is unknown.
@@ -124,7 +124,7 @@ def train(
 
 
 def _update(model: Model, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache) -> float:
-    """One step on the mean over the frames of a batch; frame by frame, so that memory does not grow with the batch."""
+    """Take one step on the mean loss of a batch, frame by frame, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     total = 0.0
     for sample in batch:

@@ -1,4 +1,4 @@
-"""Where a training stands, on disk, so that it goes on after a kill as if nothing had happened."""
+"""The progress of a training on disk, from which it continues after a kill as if nothing had happened."""
 
 import json
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class _Counts(StrictModel):
 
 @dataclass
 class Progress:
-    """Optimiser and counts of a training; the loop moves them on.
+    """Optimiser and counts of a training, which the loop updates.
 
     Attributes:
         optimizer: Adam over the model's parameters.
@@ -36,12 +36,12 @@ class Progress:
 
 
 def begin(model: Model) -> Progress:
-    """The start of a training."""
+    """Return the progress of a training at its start."""
     return Progress(torch.optim.Adam(model.parameters()))
 
 
 def save_progress(path: Path, model: Model, progress: Progress) -> None:
-    """Write weights, Adam's moments and counts to one safetensors file, whole or not at all."""
+    """Write weights, Adam's moments and counts to one safetensors file, atomically."""
     counts = {"updates": progress.updates, "seconds": progress.seconds}
     tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
     for name, parameter in model.named_parameters():
@@ -52,7 +52,7 @@ def save_progress(path: Path, model: Model, progress: Progress) -> None:
 
 
 def load_progress(path: Path, model: Model) -> Progress:
-    """Set the model's weights to those of the file, and give its optimiser and counts.
+    """Set the model's weights to those of the file, and return its optimiser and counts.
 
     Raises:
         DataError: If the file is damaged or belongs to another model.
@@ -66,7 +66,7 @@ def load_progress(path: Path, model: Model) -> Progress:
         weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         model.load_state_dict(weights)
         for name, parameter in model.named_parameters():
-            if f"adam.step.{name}" in tensors:  # one that no loss depends on has none
+            if f"adam.step.{name}" in tensors:  # a parameter that no loss depends on has no moments
                 moments = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
                 if not all(moments[key].shape == parameter.shape for key in ("exp_avg", "exp_avg_sq")):
                     raise ValueError(f"moments of {name} have another shape")

@@ -128,7 +128,7 @@ def test_what_the_trials_can_decide_is_said_before_the_bars(whole_report):
     can = "with 16 trials and 3 hyperparameters, only a hyperparameter that decides at least 62 % of the variance"
     assert 0 < text.index(can) < text.index(alt)
     assert "After 15 updates no importance is given: 15 of 16 trials are no better than predicting the mean." in text
-    assert "Found: layers (40 %, 95 % interval 30 to 50 %)." in text
+    assert "Found: network.layers (40 %, 95 % interval 30 to 50 %)." in text
 
 
 def test_without_any_importance_the_reason_stands_in_place_of_the_chart(other_run, no_charts):

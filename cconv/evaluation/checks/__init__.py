@@ -1,4 +1,4 @@
-"""Checks of stability: where models fail that are accurate on average, one file a check.
+"""Checks of stability, one file each: they find where a model fails that is accurate on average.
 
 A model may fail at the free surface, where particles clump (tensile instability), or where a scene is denser or faster
 than the training data. A task names the checks that its models must pass.
@@ -18,5 +18,5 @@ CHECKS: dict[str, type[Check]] = {
 
 
 def make_checks(material: Material) -> list[Check]:
-    """Every check that the task names, made once for all models."""
+    """Make every check that the task names, once for all models."""
     return [CHECKS[name](material) for name in material.task.checks]

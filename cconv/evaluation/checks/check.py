@@ -1,4 +1,4 @@
-"""A check of a model, and what it finds."""
+"""The base class of a check of stability, and its findings."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,19 +11,19 @@ from torch import Tensor
 from cconv.evaluation.checks.material import Material
 from cconv.evaluation.checks.predictor import Predictor
 
-NOT_FINITE = 1e9  # stands for a value that is infinite or no number, so that files can hold it
+NOT_FINITE = 1e9  # stands for infinity and NaN, which JSON files cannot hold
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What a check measured.
+    """A value that a check measured, with its limit.
 
     Attributes:
         check: Name of the check.
-        label: What was looked at, e.g. a regime or a state.
-        value: What was measured; `NOT_FINITE` for what is infinite or no number.
-        limit: What it must not exceed.
-        detail: What else a reader needs, such as the frame.
+        label: The part of the check, e.g. a regime or a state of the frame.
+        value: The measured value; `NOT_FINITE` if it is infinite or NaN.
+        limit: Largest value that passes.
+        detail: Further facts for a reader, such as the frame.
     """
 
     check: str
@@ -39,13 +39,13 @@ class Finding:
 
 
 class Check(ABC):
-    """Something that must hold for a model of a task; what it asks is made once, for all models.
+    """A requirement on the models of a task; its frames are prepared once for all models.
 
     Attributes:
         name: Name by which tasks ask for the check.
-        sentence: What it looks at, for a reader of the report.
-        failure: A finding beyond the limit in words, with its fields in braces.
-        limit: What no value may exceed.
+        sentence: Description of the measured value, for a reader of the report.
+        failure: Template of a sentence for a finding beyond the limit, with its fields in braces.
+        limit: Largest value that passes.
 
     Args:
         material: Frames with their analytic answers.
@@ -61,14 +61,14 @@ class Check(ABC):
 
     @abstractmethod
     def findings(self, predictor: Predictor) -> list[Finding]:
-        """What the check finds in a predictor; labels and their order are the same for all predictors."""
+        """Measure a predictor; labels and their order are the same for all predictors."""
 
     def description(self) -> str:
-        """The sentence, and what else the material alone says."""
+        """Return the sentence, and further facts that do not depend on the model."""
         return self.sentence
 
     def in_words(self, finding: Finding) -> str:
-        """A finding beyond the limit, in one line."""
+        """Describe a finding beyond the limit in one line."""
         return self.failure.format(**vars(finding))
 
     def _finding(self, label: str, value: Tensor | float, detail: str = "") -> Finding:
@@ -77,7 +77,7 @@ class Check(ABC):
 
 
 def worst_of_each_label(findings: Iterable[Finding]) -> list[Finding]:
-    """The finding with the largest value of each label, in the order in which labels come first."""
+    """Return the finding with the largest value of each label, in the order in which the labels first appear."""
     worst: dict[str, Finding] = {}
     for finding in findings:
         if finding.label not in worst or finding.value > worst[finding.label].value:

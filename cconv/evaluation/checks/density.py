@@ -1,4 +1,4 @@
-"""The density that follows from a predicted rate over time."""
+"""Check of the density that follows from integrating a predicted rate over time."""
 
 import math
 
@@ -14,7 +14,7 @@ USUAL = 0.95  # share of the particles whose density must keep the limit
 
 
 class IntegratedDensity(Check):
-    r"""Deviation of the density that follows from a predicted rate, along stored frames, relative.
+    r"""Relative deviation of the density that follows from integrating a predicted rate over stored frames.
 
     The analytic rate is exactly the derivative of the summed density (`cconv.sph.density_rate`), so that integrated
     without error it leads back to it, and the predicted rate to
@@ -29,8 +29,8 @@ class IntegratedDensity(Check):
 
     name = "density"
     sentence = (
-        "Relative deviation of the summed density plus what errors of the predicted rate add to it over consecutive "
-        "frames: the largest that 19 of 20 particles keep."
+        "Relative error of the density if the predicted rate is integrated over consecutive frames in place of the "
+        "analytic one: the 95th percentile of the particles, and of that the largest over the frames."
     )
     failure = "{label} deviates by {value:.3g} (limit {limit:g}); {detail}"
     limit = 0.02
@@ -44,28 +44,28 @@ class IntegratedDensity(Check):
         self._densities = torch.stack([state.densities for state in states])
 
     def findings(self, predictor: Predictor) -> list[Finding]:
-        """One finding, with the first frame whose deviation is beyond the limit."""
+        """Return one finding, with the first frame whose deviation is beyond the limit."""
         usual = self.deviations(predictor)
         outside = (~(usual <= self.limit)).nonzero()[:, 0].tolist()
         detail = f"first at frame {outside[0]} of {len(usual)}" if outside else f"over {len(usual)} frames"
         return [self._finding("integrated density", usual.max(), detail)]
 
     def description(self) -> str:
-        """The sentence, and how far the analytic rate alone is off, since it is known at stored frames alone."""
+        """Return the sentence, and the deviation of the analytic rate, which is integrated from stored frames too."""
         return (
-            f"{self.sentence} The analytic rate itself, known at stored frames alone, would be off by "
-            f"{100 * self.analytic_deviation():.3g} %: that belongs to the spacing of the frames, not to a model."
+            f"{self.sentence} The analytic rate, integrated in the same way, would have an error of "
+            f"{100 * self.analytic_deviation():.3g} %, because stored frames lie far apart; it is not counted."
         )
 
     def deviations(self, predictor: Predictor) -> Tensor:
-        """Relative deviation (T,) that nineteen of twenty particles keep at each frame, float64; inf for no number."""
+        """95th percentile over particles of the relative deviation at each frame (T,), float64; infinity for NaN."""
         predicted = torch.stack(
             [predictor.predict(frame, self.material.scene)[:, 0].double() for frame in self._frames]
         )
         return self._usual(self._integrated(predicted - self._rates) / self._densities)
 
     def analytic_deviation(self) -> float:
-        """The same, the largest over frames, of the analytic rate alone, integrated from the first density."""
+        """Largest deviation over frames if the analytic rate itself is integrated from the first density."""
         alone = (self._densities[0] + self._integrated(self._rates)) / self._densities - 1
         return float(self._usual(alone).max())
 

@@ -1,4 +1,4 @@
-"""What checks share: frames that no model was trained on, as they are and in other states, with analytic answers."""
+"""The frames that all checks share: unchanged and perturbed validation frames with their analytic fields."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from cconv.evaluation.checks.states import AS_IT_IS, State, stressed_states
 from cconv.tasks.features import FluidState
 from cconv.tasks.task import FieldTask
 
-PLAIN_FRAMES = 20  # frames that are looked at as they are
-STRESSED_FRAMES = 3  # frames that are put into other states: the first, the middle one and the last
-SMALLEST_SCALE = 0.1  # of the typical mean square, what errors are divided by where targets are smaller
-SCALED = (  # what they are divided by, in words
-    "by the mean square of the target over the same particles, or by a tenth of the target's variance where that is "
-    "larger: 1 is as bad as predicting 0"
+PLAIN_FRAMES = 20  # number of unchanged frames
+STRESSED_FRAMES = 3  # number of frames that are perturbed: the first, the middle and the last one
+SMALLEST_SCALE = 0.1  # share of the typical mean square that errors are divided by if the targets are smaller
+SCALED = (  # the divisor in words
+    "divided by the mean square of the target over the same particles, or by a tenth of the target's variance if that "
+    "is larger; 1 is as bad as predicting 0"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Probe:
-    """A frame in some state, and what a model should say of it.
+    """A frame, unchanged or perturbed, with the field that a model should predict for it.
 
     Attributes:
         name: Name of the state.
-        origin: Which frame of the data it was made of.
+        origin: The frame of the data that it was made from, in words.
         frame: Particles.
         scene: Their scene.
         target: Analytic field of its fluid particles, (N, C), float64.
         affected: Fluid particles whose errors count, (N,), bool.
-        scale: What squared errors are divided by.
+        scale: Divisor of squared errors.
     """
 
     name: str
@@ -52,11 +52,11 @@ class Material:
     """Frames of a scene for all checks and all models of a task.
 
     Attributes:
-        task: What is asked.
+        task: Task of the models.
         scene: Scene of the frames.
-        trajectory: A trajectory that is looked at over time.
-        plain: Frames as they are.
-        few: Some frames to be put into other states, and where each is from.
+        trajectory: A trajectory for checks over time.
+        plain: Unchanged frames.
+        few: Some frames to perturb, and the origin of each.
         typical: Variance of the target over the plain frames.
         fastest: Largest speed in them.
         reach: Largest distance that any model searches.
@@ -73,7 +73,7 @@ class Material:
 
     @cached_property
     def stressed(self) -> tuple[Probe, ...]:
-        """The few frames, each in every stressed state."""
+        """Return the few frames, each in every perturbed state."""
         kernel = self.task.kernel_at(self.scene.particle_spacing, self.scene.dim)
         options = {"typical_rate": self.typical**0.5, "fastest": self.fastest, "reach": self.reach}
         return tuple(
@@ -83,19 +83,19 @@ class Material:
         )
 
     def answered(self, state: State, origin: str) -> Probe:
-        """A state of a frame with its analytic answer."""
+        """Return a state of a frame with its analytic field."""
         target = self.task.field(self.task.state(state.frame, state.scene))
         return _probe(state, origin, target, self.typical)
 
     def scale(self, targets: Tensor) -> float:
-        """What squared errors of particles with targets (N, C) are divided by."""
+        """Return the divisor of squared errors of particles with targets (N, C)."""
         return _scale(targets, self.typical)
 
 
 def make_material(
     trajectories: Sequence[Trajectory], scene: Scene, task: FieldTask, reach: float | None = None
 ) -> Material:
-    """What models of a task are asked in a scene.
+    """Prepare the frames for the checks of a task in a scene.
 
     Args:
         trajectories: Trajectories that no model was trained on.
@@ -146,7 +146,7 @@ def _origin(trajectory: Trajectory, index: int) -> str:
 
 
 def _rounding(states: Sequence[FluidState], task: FieldTask) -> float:
-    """Square of a field so small that float32 cannot tell it from 0."""
+    """Return the square of the largest field that float32 cannot distinguish from 0."""
     density = max(float(state.densities.max()) for state in states)
     speed = max(float(state.velocities.norm(dim=1).max()) for state in states)
     smallest = task.magnitude(1e-4 * density, speed, states[0].kernel.smoothing_length)
@@ -167,8 +167,8 @@ def _probe(state: State, origin: str, target: Tensor, typical: float) -> Probe:
 
 
 def _scale(targets: Tensor, typical: float) -> float:
-    """Mean square of the targets of some particles, but not less than a tenth of the typical one.
+    """Return the mean square of the targets of some particles, but at least a tenth of the typical one.
 
-    So an error of 1 is as bad as predicting 0 for them, unless their targets are so small that they hardly matter.
+    So an error of 1 is as bad as predicting 0, unless the targets of the particles are too small to matter.
     """
     return max(float(targets.square().mean()) if len(targets) else 0.0, SMALLEST_SCALE * typical)

@@ -1,4 +1,4 @@
-"""How far predictions in float32 are from those in float64."""
+"""Check of the rounding errors: predictions in float32 compared with float64."""
 
 import math
 
@@ -9,18 +9,18 @@ from cconv.evaluation.checks.states import AS_IT_IS, FAR_AWAY
 
 
 class Precision(Check):
-    """Largest difference between predictions in float32 and in float64, by the root of the target's variance."""
+    """Largest difference between predictions in float32 and float64 ÷ standard deviation of the target."""
 
     name = "precision"
     sentence = (
-        "Largest difference between predictions in single and in double precision, on frames as they are and a "
-        "thousand particle spacings away, by the root of the target's variance."
+        "Largest difference between predictions in single and double precision, on unchanged frames and on frames "
+        "moved by a thousand particle spacings, divided by the standard deviation of the target."
     )
     failure = "{label} is {value:.3g} from float64 (limit {limit:g}); {detail}"
     limit = 1e-3
 
     def findings(self, predictor: Predictor) -> list[Finding]:
-        """One finding, of the state and frame with the largest difference."""
+        """Return one finding, for the state and frame with the largest difference."""
         return worst_of_each_label(
             self._finding("float32", self._difference(predictor, probe), f"{probe.name}, {probe.origin}")
             for probe in self.material.stressed

@@ -1,4 +1,4 @@
-"""What is checked: a trained model, or anything else that predicts the field of a frame."""
+"""The object that checks test: a trained model, or any other predictor of the field of a frame."""
 
 from copy import deepcopy
 from typing import Protocol
@@ -10,13 +10,13 @@ from cconv.models.model import Model
 
 
 class Predictor(Protocol):
-    """Something that predicts the field of a frame."""
+    """Interface of a predictor of the field of a frame."""
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
-        """Field (N, C) at the fluid particles, as it is used."""
+        """Predict the field (N, C) at the fluid particles in the precision of normal use."""
 
     def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
-        """The same in float64."""
+        """Predict the field in float64."""
 
 
 class ModelPredictor:
@@ -34,5 +34,5 @@ class ModelPredictor:
         return self._model.predict_frame(frame, scene)
 
     def predict_exactly(self, frame: Frame, scene: Scene) -> Tensor:
-        """The same with weights and inputs in float64."""
+        """Predict the field with weights and inputs in float64."""
         return self._exact.predict(self._model.inputs(frame, scene).double())

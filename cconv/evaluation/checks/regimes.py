@@ -1,4 +1,4 @@
-"""Errors of particles that have something in common: near walls, at the free surface, fast, crowded."""
+"""Check of the errors in regimes: groups of particles near walls, at the free surface, fast or crowded."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ NEAR = 2.0  # particle spacings within which neighbours are counted and walls ar
 
 @dataclass(frozen=True, kw_only=True)
 class Regime:
-    """Particles that have something in common.
+    """A group of particles with a common property.
 
     Attributes:
         name: Name of the regime.
-        members: Which of the fluid particles of all plain frames, one after the other, bool.
-        scale: What squared errors are divided by.
+        members: Mask over the fluid particles of all plain frames, one frame after the other, bool.
+        scale: Divisor of squared errors.
     """
 
     name: str
@@ -32,15 +32,15 @@ class Regime:
 
     @property
     def share(self) -> float:
-        """Share of the particles that belong to it."""
+        """Share of the particles that belong to the regime."""
         return float(self.members.double().mean())
 
 
 class Regimes(Check):
-    """Mean squared error of the particles of each regime by its scale."""
+    """Mean squared error of the particles of each regime ÷ its scale."""
 
     name = "regimes"
-    sentence = f"Mean squared error of particles that have something in common, on frames as they are, {SCALED}."
+    sentence = f"Mean squared error of particles with a common property, on unchanged frames, {SCALED}."
     failure = "error {value:.3g} in regime {label} (limit {limit:g})"
     limit = 0.1
 
@@ -49,7 +49,7 @@ class Regimes(Check):
         self.regimes = list(_regimes(material))
 
     def findings(self, predictor: Predictor) -> list[Finding]:
-        """A finding for each regime that has particles."""
+        """Return a finding for each regime that has particles."""
         errors = torch.cat([squared_errors(predictor, probe) for probe in self.material.plain])
         return [
             self._finding(each.name, errors[each.members].mean() / each.scale, f"{100 * each.share:.3g} % of particles")
@@ -58,7 +58,7 @@ class Regimes(Check):
 
 
 def _regimes(material: Material) -> Iterator[Regime]:
-    """The regimes that have particles."""
+    """List the regimes that have particles."""
     targets = torch.cat([probe.target for probe in material.plain])
     for name, members in _members([probe.frame for probe in material.plain], material.scene).items():
         if members.any():
@@ -66,8 +66,10 @@ def _regimes(material: Material) -> Iterator[Regime]:
 
 
 def _members(frames: Sequence[Frame], scene: Scene) -> dict[str, Tensor]:
-    """Which particles are near walls, at the free surface, in the bulk, at periodic faces; by number of neighbours and
-    by speed, a quarter of the particles each; the fastest one in a hundred.
+    """Return a mask of the particles of each regime, by its name.
+
+    The regimes are: near walls, at the free surface, in the bulk, at periodic faces; quarters of the particles by
+    number of neighbours and by speed; the fastest hundredth.
 
     Near walls: a boundary point within 2 spacings. At the surface: elsewhere, with less than three quarters of the
     median number of neighbours within 2 spacings. At a periodic face: within 2 spacings of it.
@@ -87,7 +89,7 @@ def _members(frames: Sequence[Frame], scene: Scene) -> dict[str, Tensor]:
 
 
 def _surroundings(frame: Frame, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Number of neighbours, whether a wall or a periodic face is near, and speed of each fluid particle."""
+    """Return number of neighbours, nearness of walls and periodic faces, and speed of each particle."""
     fluid, reach = frame.particle_types == ParticleType.FLUID, NEAR * scene.particle_spacing
     positions = frame.positions[fluid].double()
     edges = radius_graph(positions, reach, scene.box)
@@ -103,7 +105,7 @@ def _surroundings(frame: Frame, scene: Scene) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def _quarters(name: str, values: Tensor) -> dict[str, Tensor]:
-    """Members of the four quarters of the particles by a value; equal values stay together."""
+    """Split the particles into four quarters by a value; equal values stay together."""
     edges = torch.from_numpy(np.quantile(values.numpy(), [0.25, 0.5, 0.75]))
     places = torch.searchsorted(edges, values)
     return {f"{name}_quarter_{quarter + 1}": places == quarter for quarter in range(4)}

@@ -1,4 +1,4 @@
-"""Whether a model is stable: what every check finds in all its seeds."""
+"""The verdict on the stability of a model: the findings of every check in all its seeds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -9,12 +9,12 @@ from cconv.evaluation.checks.predictor import Predictor
 
 
 def measure_stability(seeds: Mapping[str, Predictor], checks: Sequence[Check], material: Material) -> dict:
-    """All checks of a model's seeds, as they stand in summary.json.
+    """Run all checks on all seeds of a model.
 
     Args:
         seeds: Each training of the model, by name.
-        checks: What must hold.
-        material: What the checks were made of.
+        checks: The checks to run.
+        material: The frames that the checks were made with.
 
     Returns:
         "stable", whether all seeds keep every limit; "findings", those of the worst seed for each check and label;
@@ -40,7 +40,7 @@ def measure_stability(seeds: Mapping[str, Predictor], checks: Sequence[Check], m
 
 
 def _failures(check: Check, found: Mapping[str, Sequence[Finding]], worst: Sequence[Finding]) -> list[str]:
-    """A line for each finding beyond its limit, with the seeds that it is of."""
+    """Write a line for each finding beyond its limit, with the seeds that failed."""
     lines = []
     for place, finding in enumerate(worst):
         if not finding.passes:

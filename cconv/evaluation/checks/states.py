@@ -1,4 +1,4 @@
-"""States of a frame in which methods fail, e.g. denser, faster, clumped, turned; each with the particles that count."""
+"""Perturbed states of a frame in which models fail, e.g. denser, faster, clumped or rotated."""
 
 import itertools
 import math
@@ -23,7 +23,7 @@ SQUEEZED, SQUEEZED_WITHIN = 3, 4.0  # clumps of fluid, and their radius before, 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A frame in some state.
+    """A frame in some state, unchanged or perturbed.
 
     Attributes:
         name: Name of the state.
@@ -48,10 +48,10 @@ def stressed_states(
     reach: float,
     seed: int,
 ) -> list[State]:
-    """The frame as it is, and in the states in which methods fail.
+    """Make the unchanged frame, and the frame in the states in which models fail.
 
     Denser and sparser by shares of the number density; half and double spacing of the same particles; stretched and
-    compressed along the first and the last axis; clumped pairs, squeezed clumps, isolated particles and pairs; turned,
+    compressed along the first and the last axis; clumped pairs, squeezed clumps, isolated particles and pairs; rotated,
     tilted (in open space), mirrored, reversed; ten and a hundred times as fast as the fastest; in a frame of reference
     that moves, and far from the origin. A state whose periodic box would be too narrow to search is left out.
 
@@ -132,13 +132,13 @@ def _faster_states(frame: Frame, scene: Scene, fastest: float) -> Iterator[State
 
 
 def _in_a_moving_frame(frame: Frame, scene: Scene, fastest: float) -> State:
-    """All velocities seen by somebody who passes at ten times the largest speed."""
+    """Add a constant velocity of ten times the largest speed to all velocities (a Galilean boost)."""
     passing = (10 * fastest * oblique(scene.dim)).to(frame.velocities.dtype)
     return State(name="moving_frame", frame=replace(frame, velocities=frame.velocities + passing), scene=scene)
 
 
 def _far_away(frame: Frame, scene: Scene) -> State:
-    """The scene moved by a thousand particle spacings along each axis."""
+    """Move the scene by a thousand particle spacings along each axis."""
     shift = FAR * scene.particle_spacing
     box = Box([low + shift for low in scene.box.lower], [high + shift for high in scene.box.upper], scene.box.periodic)
     boundary = frame.boundary
@@ -149,7 +149,7 @@ def _far_away(frame: Frame, scene: Scene) -> State:
 
 
 def _moved(name: str, frame: Frame, scene: Scene, matrix: Tensor, of_vectors: Tensor) -> State:
-    """A frame whose points are mapped by a matrix (D, D), with its box, and whose vectors by another."""
+    """Map the points and the box of a frame by a matrix (D, D), and its vectors by another."""
     box = _mapped_box(scene.box, matrix)
 
     def mapped(points: Tensor, by: Tensor) -> Tensor:
@@ -175,10 +175,10 @@ def _mapped_box(box: Box, matrix: Tensor) -> Box:
 def _clumped(
     frame: Frame, scene: Scene, kernel: AbstractKernel, typical_rate: float, generator: torch.Generator
 ) -> State:
-    """One fluid particle in twenty is put closely beside its nearest neighbour; the two approach or part.
+    """Put one fluid particle in twenty close to its nearest neighbour, and let the two approach or separate.
 
-    They do so as fast as it takes for the pair to dominate the rate of density of both, so that an error of the pair
-    is an error of the particles.
+    Their relative speed is so large that the pair dominates the rate of density of both particles. So an error of the
+    pair is an error of the particles.
     """
     fluid = (frame.particle_types == ParticleType.FLUID).nonzero()[:, 0]
     positions, velocities = frame.positions.double().clone(), frame.velocities.double().clone()
@@ -202,7 +202,7 @@ def _clumped(
 
 
 def _nearest_pairs(edges: Edges, particles: int, generator: torch.Generator) -> Iterator[tuple[int, int, Tensor]]:
-    """Some particles, each with its nearest neighbour and the direction from there; none belongs to two pairs."""
+    """Choose particles, each with its nearest neighbour and the direction from it; no particle is in two pairs."""
     taken: set[int] = set()
     for particle in torch.randperm(particles, generator=generator)[: max(4, particles // 20)].tolist():
         row = slice(int(edges.row_splits[particle]), int(edges.row_splits[particle + 1]))
@@ -216,7 +216,7 @@ def _nearest_pairs(edges: Edges, particles: int, generator: torch.Generator) -> 
 
 
 def _squeezed(frame: Frame, scene: Scene, generator: torch.Generator) -> State:
-    """Fluid around some particles is drawn towards them, most at the centre, where it is 0.7 times as wide."""
+    """Contract the fluid around some particles, most at the centre, where lengths shrink to 0.7."""
     fluid = (frame.particle_types == ParticleType.FLUID).nonzero()[:, 0]
     positions = frame.positions.double().clone()
     radius = SQUEEZED_WITHIN * scene.particle_spacing
@@ -232,7 +232,7 @@ def _squeezed(frame: Frame, scene: Scene, generator: torch.Generator) -> State:
 
 
 def _isolated(frame: Frame, scene: Scene, generator: torch.Generator) -> State:
-    """Some fluid particles lose all neighbours within four spacings but one, or all."""
+    """Remove all neighbours, or all but one, of some fluid particles within four spacings."""
     fluid = (frame.particle_types == ParticleType.FLUID).nonzero()[:, 0]
     chosen = torch.randperm(len(fluid), generator=generator)[:ISOLATED]
     edges = radius_graph(frame.positions[fluid].double(), 4 * scene.particle_spacing, _fitting(scene, 4.0))
@@ -255,7 +255,7 @@ def _isolated(frame: Frame, scene: Scene, generator: torch.Generator) -> State:
 
 
 def _fitting(scene: Scene, spacings: float) -> Box:
-    """The scene's box, open where it is too narrow for a search of so many spacings."""
+    """Open the axes of the scene's box that are too narrow for a neighbour search over so many spacings."""
     reach = 2 * spacings * scene.particle_spacing
     periodic = tuple(
         wraps and length >= reach for wraps, length in zip(scene.box.periodic, scene.box.lengths, strict=True)

@@ -1,4 +1,4 @@
-"""Rates of density at rest and in uniform motion, where no density changes."""
+"""Check of predicted rates of density where no density changes: at rest and in uniform motion."""
 
 from dataclasses import replace
 
@@ -12,12 +12,12 @@ from cconv.evaluation.checks.states import State, oblique
 
 
 class StillStates(Check):
-    """Mean square of a rate where nothing changes, by a tenth of the target's variance."""
+    """Mean square of a rate that should be 0 ÷ a tenth of the target's variance."""
 
     name = "still"
     sentence = (
-        "Mean squared rate at rest and in uniform motion at ten times the largest speed, where no density changes, by "
-        "a tenth of the target's variance."
+        "Mean squared rate at rest and in uniform motion at ten times the largest speed, where the true rate is 0, "
+        "divided by a tenth of the target's variance."
     )
     failure = "rate {value:.3g} where nothing changes, {label} (limit {limit:g}); {detail}"
     limit = 0.1
@@ -31,14 +31,14 @@ class StillStates(Check):
         ]
 
     def findings(self, predictor: Predictor) -> list[Finding]:
-        """A finding for each state."""
+        """Return a finding for each state."""
         return worst_of_each_label(
             self._finding(probe.name, relative_error(predictor, probe), probe.origin) for probe in self._probes
         )
 
 
 def still_states(frame: Frame, scene: Scene, fastest: float) -> list[State]:
-    """The frame at rest, and in uniform motion at ten times the speed `fastest`: its density does not change."""
+    """Return the frame at rest, and in uniform motion at ten times the speed `fastest`; its density is constant."""
     at_rest = torch.zeros_like(frame.velocities)
     moving = at_rest + 10 * fastest * oblique(scene.dim).to(at_rest.dtype)
     return [

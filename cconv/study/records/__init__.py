@@ -1,1 +1,1 @@
-"""What a study leaves on disk."""
+"""The records of a study on disk."""

@@ -1,4 +1,4 @@
-"""Where a study ran: versions, commit, data, seeds, machine."""
+"""The environment of a study: versions, commit, data, seeds, machine."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ PACKAGES = ("cconv", "torch", "numpy", "scipy", "ray", "optuna", "h5py", "pandas
 
 
 def describe_environment(study: StudyConfig, dataset: Dataset, trials_at_once: int) -> dict:
-    """Provenance of a run, as it stands in environment.json."""
+    """Describe the provenance of a run, the content of environment.json."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -40,7 +40,7 @@ def _version(package: str) -> str | None:
 
 
 def _git_commit() -> str | None:
-    """Commit of the package's source, with "+changes" if files differ from it; None outside a repository."""
+    """Return the commit of the package's source, with "+changes" if files differ; None outside a repository."""
     folder = Path(__file__).parent
     try:
         commit = _git(folder, "rev-parse", "HEAD")

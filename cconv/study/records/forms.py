@@ -1,4 +1,4 @@
-"""What the JSON files of a run folder may hold: a file that does not fit is refused in one line."""
+"""The forms of the JSON files of a run folder; a file that does not fit its form is an error of one line."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -28,7 +28,7 @@ class Entry(OpenModel):
 
 
 class TrainingDescription(OpenModel):
-    """config.json of a training; what costs nothing was known before it began, the rest is None where it failed."""
+    """config.json of a training; values that are None belong to a training that failed before it began."""
 
     stage: Name
     parameters: dict[str, Value]
@@ -52,7 +52,7 @@ class _StageSettings(OpenModel):
 
 
 class _Study(OpenModel):
-    """study.json, as far as a reader of records needs it."""
+    """The part of study.json that readers of records need."""
 
     format: Count = 1
     id: Annotated[str, Field(pattern=r"^[0-9a-f]{1,64}$")] = "0"
@@ -81,7 +81,7 @@ class Rungs(RootModel):
 
 
 class _Line(OpenModel):
-    """Something that does not make sense in the data."""
+    """An implausibility of the data."""
 
     line: str
 
@@ -101,7 +101,7 @@ class _DataFolder(OpenModel):
 
 
 class _Environment(OpenModel):
-    """environment.json, as far as the report needs it."""
+    """The part of environment.json that the report needs."""
 
     started: str
     packages: dict[str, str | None]
@@ -125,7 +125,7 @@ FORMS: dict[str, type[BaseModel]] = {
 
 
 def read_typed(path: Path, form: type[Model]) -> Model:
-    """Content of a JSON file as an instance of its form.
+    """Read a JSON file as an instance of its form.
 
     Raises:
         DataError: If the file is missing or damaged, or a key or value does not fit.
@@ -134,7 +134,7 @@ def read_typed(path: Path, form: type[Model]) -> Model:
 
 
 def read_record(path: Path, form: type[BaseModel] = Table) -> dict[str, Any]:
-    """Content of a JSON file that fits a form, as it stands there.
+    """Read a JSON file, check it against a form, and return its content unchanged.
 
     Raises:
         DataError: If the file is missing or damaged, or a key or value does not fit.
@@ -145,5 +145,5 @@ def read_record(path: Path, form: type[BaseModel] = Table) -> dict[str, Any]:
 
 
 def read_rungs(path: Path) -> dict[str, list[dict]]:
-    """Rungs of every stage that has any, from rungs.json."""
+    """Read the rungs of every stage that has any from rungs.json."""
     return read_record(path, Rungs) if path.exists() else {}

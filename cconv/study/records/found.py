@@ -1,7 +1,7 @@
-"""What the stages of a study find, as typed values: each stage's part of ``stages/<name>.json`` and ``summary.json``.
+"""The results of the stages of a study as typed values, in ``stages/<name>.json`` and ``summary.json``.
 
-Errors are those of the objective that the task names. A field that ends in ``ci95`` is a 95 % interval, None where
-there is too little for one.
+Errors are those of the objective of the task. A field that ends in ``ci95`` is a 95 % interval, or None if there are
+too few values for one.
 """
 
 from typing import Literal, NamedTuple
@@ -13,15 +13,15 @@ Interval = tuple[Real, Real]
 
 
 class SeedVariance(StrictModel):
-    """Spread of the error over initial weights beside that over configurations, at a rung.
+    """Spread of the error over initial weights compared with the spread over configurations, at a rung.
 
     Attributes:
         updates: Gradient updates of the rung.
-        seeds: Trainings of one configuration that differ in the seed.
-        configurations: Trainings with one seed that differ in the configuration.
+        seeds: Number of trainings of one configuration that differ in the seed.
+        configurations: Number of trainings with one seed that differ in the configuration.
         seed_spread: Standard deviation of log10 error over the seeds.
         configuration_spread: The same over the configurations.
-        seed_share: Variance over seeds by that over configurations; None where the latter is 0.
+        seed_share: Variance over seeds ÷ variance over configurations; None if the latter is 0.
         seed_share_ci95: Its interval.
     """
 
@@ -35,21 +35,21 @@ class SeedVariance(StrictModel):
 
 
 class RungAudit(StrictModel):
-    """How well the order of trials at a rung predicts their order at the full budget; measures of too few are None.
+    """How well the order of trials at a rung predicts their order at the full budget; None with too few trials.
 
     Attributes:
         updates: Gradient updates of the rung.
-        trials: Trials that nothing stopped, measured at the rung and at the end.
-        top: How many of them count as the best.
+        trials: Number of trials without early stopping, measured at the rung and at the full budget.
+        top: Number of trials that count as the best.
         spearman: Rank correlation of the two orders.
         kendall: Kendall's rank correlation.
-        crossing_rate: Share of the pairs of trials whose order turns.
+        crossing_rate: Share of the pairs of trials whose order changes.
         recall: Share of the best at the end among the best at the rung.
-        survival: Share of the best at the end among those that go on from the rung.
-        regret: Final error of the best at the rung by the smallest final error.
+        survival: Share of the best at the end among the trials that continue beyond the rung.
+        regret: Final error of the best trial at the rung ÷ smallest final error.
         spearman_ci95: Interval of the rank correlation.
         why_no_interval: The reason why there is none, or "".
-        verdict: Whether trials can be stopped at the rung.
+        verdict: Whether the rung is reliable for early stopping.
     """
 
     updates: Count
@@ -67,14 +67,14 @@ class RungAudit(StrictModel):
 
 
 class ReplayedStrategy(StrictModel):
-    """A search strategy replayed on trials that nothing stopped, drawn anew many times.
+    """A stopping rule replayed on trials without early stopping, which are redrawn many times.
 
     Attributes:
         strategy: Its name.
         updates_each: Updates that "little_each" gives every trial; None for the others.
         keep: How many trials "little_each" then trains to the end; None for the others.
-        share: Updates that it spends by those of training every trial to the end.
-        regret: Best error that it finds by the best of all, geometric mean over the draws.
+        share: Updates that it spends ÷ updates of training every trial to the full budget.
+        regret: Best error that it finds ÷ best error of all trials, geometric mean over the draws.
         regret_range95: Range of that ratio in 95 % of the draws.
     """
 
@@ -95,15 +95,15 @@ class TestedShare(NamedTuple):
 
 
 class ParameterImportance(StrictModel):
-    """How much a hyperparameter decides; the tested values are None where the trials do not vary it.
+    """Importance of a hyperparameter; the tested values are None if the trials do not vary it.
 
     Attributes:
-        share: Share of the variance of log10 error that it decides alone.
+        share: Share of the variance of log10 error that the hyperparameter alone explains.
         low: Lower end of the 95 % interval of the share.
         high: Upper end.
-        p_value: Of no influence, adjusted for the number of hyperparameters.
-        decided: Whether that is below 5 %.
-        f_anova: The share by a random forest.
+        p_value: p-value of the hypothesis of no influence, adjusted for the number of hyperparameters.
+        decided: Whether the p-value is below 5 %.
+        f_anova: The share estimated by a random forest.
         ped_anova: How much the best trials differ from all in it, as a share of the sum.
     """
 
@@ -124,17 +124,17 @@ class ParameterImportance(StrictModel):
 
 
 class RungImportance(StrictModel):
-    """Importance of all hyperparameters at a rung; without any, the measures are None and `why_none` says why.
+    """Importance of all hyperparameters at a rung; if none is given, the measures are None and `why_none` says why.
 
     Attributes:
         updates: Gradient updates of the rung.
         trials: Trials that were measured there.
-        clipped: How many count with the error of a useless model.
-        censored: Whether trials that were stopped before are missing.
+        clipped: Number of trials whose error is replaced by the error of a useless model.
+        censored: Whether trials are missing because they were stopped before the rung.
         why_none: The reason why no importance is given, or "".
-        detectable_share: Smallest share that is found four times in five.
-        surrogate_r2: R² of a random forest on unseen trials; None also where all errors are equal.
-        best_share: Share of the trials that PED-ANOVA takes for the best.
+        detectable_share: Smallest share that is detected with a probability of 80 %.
+        surrogate_r2: R² of a random forest on unseen trials; None also if all errors are equal.
+        best_share: Share of the trials that PED-ANOVA counts as the best.
         parameters: Importance of each hyperparameter.
     """
 
@@ -161,13 +161,13 @@ class PartialDependence(StrictModel):
 
     Attributes:
         parameter: The hyperparameter.
-        scale: How its values are spread.
-        updates: Gradient updates of the errors.
-        trials: Trials that were measured there.
-        surrogate_r2: R² of the forest on unseen trials; None where all errors are equal.
+        scale: Scale of its values.
+        updates: Gradient updates at which the errors were measured.
+        trials: Number of trials that were measured there.
+        surrogate_r2: R² of the forest on unseen trials; None if all errors are equal.
         values: Values of the hyperparameter.
         error: Expected error at each value.
-        low: Lower end of the middle 80 % of the trees there.
+        low: Lower end of the middle 80 % of the trees at each value.
         high: Upper end.
         points: The trials themselves.
     """
@@ -185,12 +185,12 @@ class PartialDependence(StrictModel):
 
 
 class SearchStrategy(StrictModel):
-    """What a rule for stopping trials spent on a search and found.
+    """Cost and result of a stopping rule in a search.
 
     Attributes:
         updates: Gradient updates spent.
         best_valid: Smallest validation error of a completed trial; None without one.
-        curve: (updates spent, smallest error so far), one entry a trial.
+        curve: (updates spent, smallest error so far), one entry for each trial.
     """
 
     updates: Count
@@ -199,7 +199,7 @@ class SearchStrategy(StrictModel):
 
 
 class SpentUpdates(StrictModel):
-    """Gradient updates that a search spent, what it would have spent had nothing been stopped, and their ratio."""
+    """Gradient updates that a search spent, those that it would have spent without early stopping, and their ratio."""
 
     updates: Count
     full_updates: Count
@@ -207,11 +207,11 @@ class SpentUpdates(StrictModel):
 
 
 class References(StrictModel):
-    """ASHA beside another rule at the same budget.
+    """ASHA compared with another stopping rule at the same budget.
 
     Attributes:
-        strategies: What each rule found on each search, by a name for both.
-        asha_share: What early stopping saved, by search.
+        strategies: Result of each rule in each search, by a name for both.
+        asha_share: Updates spent with early stopping, by search.
     """
 
     strategies: dict[str, SearchStrategy]
@@ -219,7 +219,7 @@ class References(StrictModel):
 
 
 class AblationStep(StrictModel):
-    """A model trained anew after one change; its errors and size are None where it was not trained or failed.
+    """A model retrained after one change; its errors and size are None if it was not trained or failed.
 
     Attributes:
         change: The hyperparameter or feature that changed.
@@ -227,7 +227,7 @@ class AblationStep(StrictModel):
         valid_error: Validation error, mean over the seeds.
         low: Smallest error of a seed.
         high: Largest.
-        flops_per_particle: Operations of one particle's prediction.
+        flops_per_particle: Operations of a prediction per particle.
         num_parameters: Learned parameters.
     """
 
@@ -241,13 +241,13 @@ class AblationStep(StrictModel):
 
 
 class Ablation(StrictModel):
-    """What each change brings.
+    """The error after each change between the baseline and the best model.
 
     Attributes:
         of: The best finalist.
         error: Its validation error, mean over the seeds.
         path: From the baseline to the best trained finalist, one change after the other.
-        branches: The best finalist with one feature left out or added, whose path is the `change`.
+        branches: The best finalist with one optional feature removed or added; its path is the `change`.
     """
 
     of: Id
@@ -282,18 +282,18 @@ class Convergence(StrictModel):
 
 
 class Parts(StrictModel):
-    """Parts of the summary that stages before the selection find; one that no stage looked for is empty.
+    """Parts of the summary that come from the stages before the selection; a part without its stage is empty.
 
     Attributes:
-        refined: What a narrowed space draws each hyperparameter from, in words.
-        initialization: The luck of initial weights, by rung.
-        rung_audit: Whether trials can be stopped at a rung.
-        strategies: Search strategies replayed.
-        references: ASHA beside another rule, by real trainings.
+        refined: Domain of each hyperparameter in the narrowed space and the reason, in words.
+        initialization: Seed variance, by rung.
+        rung_audit: Reliability of early stopping, by rung.
+        strategies: Stopping rules replayed on trials without early stopping.
+        references: ASHA compared with another stopping rule, by real trainings.
         importance: Importance of the hyperparameters, by rung.
-        partial_dependence: How the error depends on the strongest of them.
-        ablation: What each change between the baseline and the best model brings.
-        convergence: Larger budgets, by finalist.
+        partial_dependence: Dependence of the error on the strongest of them.
+        ablation: Error after each change between the baseline and the best model.
+        convergence: Errors with larger budgets, by finalist.
     """
 
     refined: dict[str, str] = {}
@@ -307,12 +307,12 @@ class Parts(StrictModel):
     convergence: dict[Id, Convergence] = {}
 
     def found(self) -> dict:
-        """The parts that a stage looked for, by name."""
+        """Return the parts that were set by a stage, by name."""
         return {name: getattr(self, name) for name in Parts.model_fields if name in self.model_fields_set}
 
 
 class Found(Parts):
-    """What a stage has found.
+    """The result of a stage.
 
     Attributes:
         finalists: Hyperparameters of the finalists that it retrained, by id.
@@ -324,7 +324,7 @@ class Found(Parts):
 
 
 class StageResult(Found):
-    """A stage that has ended, in ``stages/<name>.json``: its kind, its duration, and what it has found."""
+    """The record of a finished stage, ``stages/<name>.json``: its kind, its duration and its result."""
 
     kind: str
     seconds: NonNegative

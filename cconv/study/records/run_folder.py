@@ -1,4 +1,4 @@
-"""The run folder: our own records of a study. Ray's files are disposable, these are the truth."""
+"""The run folder with the records of a study. All facts are read from these records, never from Ray's own files."""
 
 import re
 import shutil
@@ -17,10 +17,10 @@ from cconv.study.records.summary import Summary
 from cconv.study.records.trials import KNOWN_BEFORE, TrialFolder, TrialRecord
 from cconv.validation import Id, check_setting
 
-FORMAT = 4  # of a run folder; another one is refused
+FORMAT = 4  # version of the layout of run folders; other versions are refused
 
-_PART = re.compile(r"\..+-\d+(\.\w+)?")  # names of what is being written, which a kill leaves behind
-_FIRST_FILES = {"space.json", "state.json"}  # of a run folder, written before study.json
+_PART = re.compile(r"\..+-\d+(\.\w+)?")  # temporary names; a kill leaves such files behind
+_FIRST_FILES = {"space.json", "state.json"}  # written before study.json
 
 
 class RunFolder:
@@ -31,9 +31,9 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path | str, overwrite: bool = False) -> "RunFolder":
-        """A new run folder; with `overwrite` it replaces an older run, never anything else.
+        """Create a run folder; with `overwrite` it replaces an older run, but never another folder.
 
-        A folder whose run was killed before study.json was written counts as new.
+        A folder whose run was killed before study.json was written may be replaced too.
 
         Raises:
             ConfigError: If the folder exists already.
@@ -54,7 +54,7 @@ class RunFolder:
         return bool(names) and all(name in _FIRST_FILES or _PART.fullmatch(name) for name in names)
 
     def remove_half_written(self) -> None:
-        """Delete what a killed process was writing; only who holds the folder may."""
+        """Delete the unfinished files of a killed process; call this only while holding the lock of the folder."""
         for path in [path for path in self.path.rglob(".*") if _PART.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -67,10 +67,10 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path | str) -> "RunFolder":
-        """An existing run folder.
+        """Open an existing run folder.
 
         Raises:
-            DataError: If it is none, or one of another version.
+            DataError: If the folder is no run folder or has another version.
         """
         run = cls(path)
         if not (run.path / "study.json").is_file():
@@ -85,7 +85,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder alone; the system lets go of it even if the process is killed.
+        """Lock the folder for this process; the system releases the lock even if the process is killed.
 
         Raises:
             ConfigError: If another run works in the folder.
@@ -104,22 +104,22 @@ class RunFolder:
             yield
 
     def trial(self, trial_id: str) -> TrialFolder:
-        """Folder of a search trial."""
+        """Return the folder of a search trial."""
         return TrialFolder(self.path / "trials" / checked_id(trial_id))
 
     def finalist(self, finalist_id: str, seed: int) -> TrialFolder:
-        """Folder of one retraining of a finalist."""
+        """Return the folder of one retraining of a finalist."""
         return TrialFolder(self.path / "finalists" / checked_id(finalist_id) / f"seed_{seed:d}")
 
     def trials(self) -> list[TrialRecord]:
-        """Records of all search trials, stage after stage, in the order in which they were drawn."""
+        """Read the records of all search trials, stage after stage, in the order in which they were drawn."""
         return [record for stage in self.read("study.json")["stages"] for record in self.trials_of(stage)]
 
     def trials_of(self, stage: str) -> list[TrialRecord]:
-        """Records of one stage's trials, in the order in which they were drawn.
+        """Read the records of the trials of one stage, in the order in which they were drawn.
 
         Raises:
-            DataError: If a record is damaged, or that of a trial of another stage.
+            DataError: If a record is damaged or belongs to another stage.
         """
         name = re.compile(rf"{re.escape(stage)}_(\d{{4,}})")
         matches = [name.fullmatch(folder.name) for folder in _folders(self.path / "trials")]
@@ -134,16 +134,16 @@ class RunFolder:
         path = self.trial(record.id).path / "config.json"
         if record.stage != stage:
             raise DataError(f"{path}: `stage` must be {stage!r}, got {shown(record.stage)}; restore the file.")
-        for name in KNOWN_BEFORE:  # None where it failed before it began
+        for name in KNOWN_BEFORE:  # None if the trial failed before it began
             if record.log and record.config[name] is None:
                 raise DataError(f"{path}: `{name}` is missing, though the trial was evaluated; restore the file.")
 
     def has_result(self, stage: str) -> bool:
-        """Whether a stage has come to its end."""
+        """Tell whether a stage has finished."""
         return self._result(stage).is_file()
 
     def result(self, stage: str) -> StageResult:
-        """What a stage that ended has found.
+        """Read the result of a finished stage.
 
         Raises:
             DataError: If its file is missing or damaged, or a key or value does not fit.
@@ -151,12 +151,12 @@ class RunFolder:
         return read_typed(self._result(stage), StageResult)
 
     def write_result(self, stage: str, kind: str, seconds: float, found: Found) -> None:
-        """Record what a stage has found, by which a reader knows that it has ended."""
+        """Write the result of a stage; its file marks the stage as finished."""
         result = {"kind": kind, "seconds": seconds} | found.model_dump(mode="json", exclude_unset=True)
         write_json(self._result(stage), result)
 
     def forget_result(self, stage: str) -> None:
-        """Make a stage one that has not come to its end; its trials stay."""
+        """Mark a stage as unfinished; its trials stay."""
         self._result(stage).unlink(missing_ok=True)
 
     def _result(self, stage: str) -> Path:
@@ -164,11 +164,11 @@ class RunFolder:
 
     @property
     def has_summary(self) -> bool:
-        """Whether the study has recommended a model."""
+        """True if the study has recommended a model."""
         return self._summary.is_file()
 
     def summary(self) -> Summary:
-        """What a study that recommended a model has found.
+        """Read the summary of a finished study.
 
         Raises:
             DataError: If its file is missing or damaged, or a key or value does not fit.
@@ -184,7 +184,7 @@ class RunFolder:
         return self.path / "summary.json"
 
     def retrainings(self) -> dict[str, list[TrialRecord]]:
-        """Records of all retrainings, by finalist."""
+        """Read the records of all retrainings, by finalist."""
         records: dict[str, list[TrialRecord]] = {}
         for finalist in _folders(self.path / "finalists"):
             seeds = [TrialFolder(folder) for folder in _folders(finalist) if re.fullmatch(r"seed_\d+", folder.name)]
@@ -214,10 +214,10 @@ class RunFolder:
 
 
 def checked_id(name: str) -> str:
-    """The id of a trial or finalist, which becomes a folder.
+    """Return the id of a trial or finalist, after a check that it is a safe name of a folder.
 
     Raises:
-        ConfigError: If it could lead out of the folder of all of them.
+        ConfigError: If the id could lead out of the run folder.
     """
     check_setting(Id, name, "the id of a training")
     return name

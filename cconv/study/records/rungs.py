@@ -1,7 +1,7 @@
-"""Rungs of ASHA, kept by ourselves: who was measured where, with which error, and who goes on.
+"""Rungs of ASHA: the errors of the trials that reached each rung, and which of them continue.
 
 Source: Li et al., "A System for Massively Parallel Hyperparameter Tuning" (MLSys 2020), the stopping variant with one
-bracket. Ray's own scheduler decides alike, but forgets its rungs when a run is restored.
+bracket. Ray's own scheduler makes the same decisions, but loses its rungs when a run is restored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,11 +15,11 @@ from cconv.study.records.summary import PassedRung
 
 
 class RungTable:
-    """Errors at each rung in the order in which they came.
+    """Errors at each rung, in the order in which the trials reached it.
 
     Args:
-        rungs: Updates of the rungs, ascending; the last one is the full budget, where nothing is decided.
-        reduction_factor: A trial goes on if its error is within the best 1 / `reduction_factor` of those before it.
+        rungs: Updates of the rungs, ascending; the last one is the full budget, where no trial is stopped.
+        reduction_factor: A trial continues if its error is in the best 1 / `reduction_factor` of those before it.
         recorded: Errors of an earlier run: for each rung a mapping of trials to errors.
     """
 
@@ -29,10 +29,10 @@ class RungTable:
         self._recorded = [dict(errors) for errors in recorded] or [{} for _ in rungs]
 
     def record(self, trial: str, updates: int, error: float) -> bool:
-        """Whether a trial goes on after an evaluation; between rungs it does.
+        """Record an evaluation and return True if the trial continues; between rungs it always does.
 
-        The first trial at a rung goes on. What was recorded before is decided again from the errors that stood there at
-        that time, so that a run which was killed decides as it would have.
+        The first trial at a rung continues. A trial that was recorded before is compared with the same errors as the
+        first time, so a killed run repeats its decisions.
         """
         if updates not in self.rungs:
             return True
@@ -44,10 +44,10 @@ class RungTable:
         return bool(error <= np.percentile(before, 100 * self._quantile))
 
     def passed(self) -> list[PassedRung]:
-        """How many went on from each rung but the last that was reached.
+        """Count the trials that continued beyond each rung that was reached, except the last rung.
 
-        More than 1 / `reduction_factor` do: the first trial at a rung always goes on, and those soon after it are
-        compared with few others.
+        More than 1 / `reduction_factor` of them do, because the first trial at a rung always continues, and the next
+        ones are compared with few others.
         """
         return [
             PassedRung(
@@ -60,7 +60,7 @@ class RungTable:
         ]
 
     def entries(self) -> list[dict]:
-        """One entry a rung: "updates" and "recorded", its errors by trial."""
+        """Return one entry for each rung: "updates" and "recorded", its errors by trial."""
         return [
             {"updates": updates, "recorded": dict(errors)}
             for updates, errors in zip(self.rungs, self._recorded, strict=True)
@@ -74,11 +74,11 @@ class RungFile:
         self._path = path
 
     def read(self) -> dict[str, list[dict]]:
-        """Rungs of every stage that has any."""
+        """Read the rungs of every stage that has any."""
         return read_rungs(self._path)
 
     def table(self, stage: str, rungs: Sequence[int], reduction_factor: int) -> RungTable:
-        """The table of a stage as it was left, or an empty one."""
+        """Return the recorded table of a stage, or an empty one."""
         entries = {entry["updates"]: entry["recorded"] for entry in self.read().get(stage, [])}
         return RungTable(rungs, reduction_factor, [entries.get(updates, {}) for updates in rungs])
 

@@ -1,7 +1,7 @@
-"""The summary of a finished study, as typed values: what the selection found, and the parts of the other stages.
+"""The summary of a finished study as typed values: results of the selection, and the parts of the other stages.
 
-Errors are those of the objective that the task names, and times are those of one frame. ``ci95`` is a 95 % interval,
-None where there is too little for one.
+Errors are those of the objective of the task, and times are those of one frame. ``ci95`` is a 95 % interval, or None if
+there are too few values for one.
 """
 
 from pydantic import Field, model_validator
@@ -12,15 +12,15 @@ from cconv.validation import Flag, Id, Name, PathText, Real, StrictModel, Value
 
 
 class TaskFacts(StrictModel):
-    """The task of a study, for readers.
+    """The task of a study in words, for the report.
 
     Attributes:
         name: Name of the task.
-        symbol: Symbol of what networks predict.
-        meaning: What networks predict, in words.
-        error: What errors are called.
-        error_meaning: What that is, in words.
-        measures: What else is measured, by name: what it is, in words.
+        symbol: Symbol of the predicted quantity.
+        meaning: Explanation of the predicted quantity.
+        error: Name of the error.
+        error_meaning: Explanation of the error.
+        measures: Explanation of each further measure, by its name.
     """
 
     name: Name
@@ -58,8 +58,8 @@ class Errors(StrictModel):
 
     Attributes:
         error: The error.
-        in_words: What it means, as the end of a sentence.
-        measures: Further measures by name; None where one is not defined.
+        in_words: Meaning of the error, as the end of a sentence.
+        measures: Further measures by name; None if a measure is not defined.
         ci95: Interval of the error over seeds and units.
         why_no_interval: The reason why there is none, or "".
         by_seed: Error of each training.
@@ -89,7 +89,7 @@ class AnalyticCost(FrameTime):
     """Cost of the analytic field; "network" are the sums over the pairs.
 
     Attributes:
-        turns_ms: Time of each turn; the same turn of all models that were timed together had the same frame.
+        turns_ms: Time of each turn; in the same turn all models predict the same frame.
     """
 
     turns_ms: tuple[NonNegative, ...]
@@ -99,11 +99,11 @@ class ModelCost(AnalyticCost):
     """Cost of a finalist.
 
     Attributes:
-        us_per_particle: Median time by the number of particles, µs.
+        us_per_particle: Median time ÷ number of particles, µs.
         peak_mb: Memory that predictions add to a fresh process, MB.
-        flops_per_particle: Operations of one particle's prediction.
-        threads: Threads of the measurement.
-        num_particles: Particles of a frame, mean.
+        flops_per_particle: Operations of a prediction per particle.
+        threads: Number of threads of the measurement.
+        num_particles: Mean number of particles of a frame.
     """
 
     us_per_particle: NonNegative
@@ -114,7 +114,7 @@ class ModelCost(AnalyticCost):
 
 
 class SizeTime(FrameTime):
-    """Time of a frame of so many particles."""
+    """Time of a frame with a given number of particles."""
 
     num_particles: Count
 
@@ -125,7 +125,7 @@ class Growth(StrictModel):
     Attributes:
         sizes: Numbers of particles.
         models: Times of each model.
-        exponents: Slope of time over number in logarithms, of each model measured at several sizes.
+        exponents: Slope of log time against log number of particles, for each model measured at several sizes.
         left_out: Sizes that would have taken too long, by model.
     """
 
@@ -136,7 +136,7 @@ class Growth(StrictModel):
 
 
 class FinalistConfig(StrictModel):
-    """Settings of a finalist, and the hyperparameters that gave them."""
+    """Settings of a finalist, and the hyperparameters that they come from."""
 
     network: dict
     training: dict
@@ -144,14 +144,14 @@ class FinalistConfig(StrictModel):
 
 
 class Finding(StrictModel):
-    """What a check of stability measured in the worst seed of a finalist.
+    """A value that a check of stability measured in the worst seed of a finalist.
 
     Attributes:
         check: Name of the check.
-        label: What was looked at.
-        value: What was measured.
-        limit: What it must not exceed.
-        detail: What else a reader needs.
+        label: The part of the check, e.g. a regime or a state.
+        value: The measured value.
+        limit: Largest value that passes.
+        detail: Further facts for a reader.
     """
 
     check: Name
@@ -162,12 +162,12 @@ class Finding(StrictModel):
 
     @property
     def passes(self) -> bool:
-        """Whether the limit is kept."""
+        """True if the value does not exceed the limit."""
         return self.value <= self.limit
 
 
 class CheckedCounts(StrictModel):
-    """How many seeds were checked, on how many frames as they are, and on how many in every other state."""
+    """Numbers of checked seeds, of unchanged frames, and of frames in every perturbed state."""
 
     seeds: Count
     plain_frames: Count
@@ -179,9 +179,9 @@ class Stability(StrictModel):
 
     Attributes:
         stable: Whether all seeds keep every limit.
-        findings: What the checks measured; their checks and labels are the same for all finalists.
+        findings: Measured values; their checks and labels are the same for all finalists.
         failures: A line for each finding beyond its limit.
-        counts: What was looked at.
+        counts: Numbers of checked seeds and frames.
     """
 
     stable: Flag
@@ -198,12 +198,12 @@ class FinalistEntry(StrictModel):
         config: Its settings.
         num_parameters: Learned parameters.
         updates: Gradient updates of each training.
-        fall_at_the_end: Share by which the error fell in the last quarter of the updates; None where none was measured.
+        fall_at_the_end: Relative fall of the error in the last quarter of the updates; None if it was not measured.
         valid: Errors on the validation split.
         test: Errors on the test split.
         cost: Cost of a prediction.
         stability: Checks of stability.
-        checkpoint: Folder of the best model, in the run folder.
+        checkpoint: Folder of the best model, relative to the run folder.
         train_seconds: Duration of a training, mean.
     """
 
@@ -221,7 +221,7 @@ class FinalistEntry(StrictModel):
 
 
 class AttainmentStep(StrictModel):
-    """Test error that one seed of each model attains at a time per frame: median, and the range of 8 of 10 draws."""
+    """Test error that one random seed of each model attains at a time per frame: median and range of 8 of 10 draws."""
 
     ms_per_frame: NonNegative
     median: NonNegative
@@ -253,13 +253,13 @@ class Recommended(StrictModel):
 
 
 class ComparedModel(StrictModel):
-    """A finalist beside the most accurate one, by validation errors.
+    """A finalist compared with the most accurate one by validation errors.
 
     Attributes:
         id: Its id.
         error: Its error.
         ms_per_frame: Its time.
-        ratio: Its error by the best's, geometric mean over seeds and units.
+        ratio: Its error ÷ error of the best, geometric mean over seeds and units.
         log_standard_error: Standard error of the logarithm of the ratio.
         ci95: Interval of the ratio.
         within_one_se: Whether it is within one standard error of the best.
@@ -267,7 +267,7 @@ class ComparedModel(StrictModel):
         accurate_enough: Whether the error is below the limit of the study.
         stable: Whether it passed every check of stability.
         eligible: Whether it may be recommended.
-        why_not: Why not, or "".
+        why_not: The reason why it may not be recommended, or "".
     """
 
     id: Id
@@ -285,7 +285,12 @@ class ComparedModel(StrictModel):
 
 
 class ExpectedError(StrictModel):
-    """Test error to expect of a new training of what is chosen without one seed, and how often each model is chosen."""
+    """Test error to expect of a new training of the chosen model, by leaving out one seed at a time.
+
+    Attributes:
+        error: Mean test error of the model chosen without a seed, trained with that seed.
+        choices: How often each model is chosen.
+    """
 
     error: NonNegative
     choices: dict[Id, Count]
@@ -299,9 +304,9 @@ class Selection(StrictModel):
         margin: Margin of non-inferiority, as a share.
         best: The most accurate finalist.
         tied: Finalists whose times cannot be told apart from the fastest's.
-        by_rule: What each rule alone would choose.
-        comparisons: Every finalist beside the best.
-        retrained: What a new training would give; None with a single seed.
+        by_rule: The model that each rule alone would choose.
+        comparisons: Every finalist compared with the best.
+        retrained: Error to expect of a new training; None with a single seed.
     """
 
     units: Count
@@ -327,7 +332,7 @@ class SearchPoint(StrictModel):
 
 
 class TimeCoefficients(StrictModel):
-    """Time of a particle's prediction: a constant, and times of an operation and of a byte, in µs."""
+    """Coefficients of the time of a prediction per particle: a constant, and times per operation and byte, in µs."""
 
     us_per_particle: Real
     us_per_flop: Real
@@ -335,7 +340,7 @@ class TimeCoefficients(StrictModel):
 
 
 class CostModel(StrictModel):
-    """The model that estimates times, and how far its estimates of measured models are off (µs a particle)."""
+    """The model that estimates times, and the errors of its estimates for measured models (µs per particle)."""
 
     time_model: TimeCoefficients
     measured: dict[Id, Real]
@@ -346,7 +351,7 @@ class CostModel(StrictModel):
 
 
 class PassedRung(StrictModel):
-    """How many trials were measured at a rung, and how many of them went on."""
+    """Numbers of trials that were measured at a rung and that continued beyond it."""
 
     updates: Count
     trials: Count
@@ -354,29 +359,29 @@ class PassedRung(StrictModel):
 
 
 class Selected(StrictModel):
-    """What the selection finds.
+    """The results of the selection.
 
     Attributes:
         study: Name of the study.
         task: Its task.
         dataset: Its data.
         baseline: Id of the published network among the finalists.
-        checks: What each check of stability looks at, by name; empty for a task without checks.
+        checks: Description of each check of stability, by name; empty for a task without checks.
         mean_predictor: Error of predicting the mean.
         finalists: The finalists that were compared.
-        budget: What the budget decided, in words; "" where it decided nothing.
-        failed_finalists: What became of the others, by id.
-        pareto_front: Ids of the finalists that none is both more accurate and faster than, fastest first.
+        budget: Influence of the training budget on the result, in words; "" if there is none.
+        failed_finalists: Outcome of the finalists that were not compared, by id.
+        pareto_front: Ids of the finalists on the Pareto front of validation error and time, fastest first.
         front: Uncertainty of that front.
         recommended: The finalist to use.
-        selection: How it was chosen.
-        search_points: Trials of the search; empty where too few models were timed.
-        cost_model: What estimates their times; None where too few models were timed.
+        selection: The comparison behind the choice.
+        search_points: Trials of the search; empty if too few models were timed.
+        cost_model: The model that estimates their times; None if too few models were timed.
         analytic: Cost of the analytic field; None for a task without one.
-        growth: How times grow with the scene.
+        growth: Growth of the times with the number of particles.
         explained: Ids of the finalists whose filters and fields are in ``explanation/``.
         trials: Number of trainings, by stage and outcome.
-        rungs: How many trials went on, by search and rung.
+        rungs: Numbers of trials that continued, by search and rung.
         wall_seconds: Duration of the study.
     """
 
@@ -404,7 +409,7 @@ class Selected(StrictModel):
 
 
 class Summary(Parts, Selected):
-    """A finished study, in ``summary.json``: what the selection found, then what the stages before it found."""
+    """A finished study, ``summary.json``: the results of the selection and of the stages before it."""
 
     @model_validator(mode="after")
     def _a_finalist_is_recommended(self) -> "Summary":
@@ -413,7 +418,7 @@ class Summary(Parts, Selected):
         return self
 
     def finalist(self, name: str) -> FinalistEntry | None:
-        """The finalist of an id; None if it was not compared."""
+        """Return the finalist with an id; None if it was not compared."""
         return next((entry for entry in self.finalists if entry.id == name), None)
 
     @property

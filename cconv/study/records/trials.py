@@ -1,4 +1,4 @@
-"""One training on disk: its configuration, its log, how it ended, its checkpoint."""
+"""The record of one training on disk: configuration, log, outcome and checkpoint."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from cconv.files import parse_json, read_text, write_json, write_text
 from cconv.study.records.forms import OUTCOMES, Entry, Outcome, TrainingDescription, read_record
 from cconv.validation import validated
 
-DIVERGED_ERROR = 1e9  # Optuna needs a finite number where a trial diverged; our records hold none there
+DIVERGED_ERROR = 1e9  # Optuna needs a finite error of a diverged trial; our records hold None
 
 
 KNOWN_BEFORE = ("init_seed", "num_parameters", "flops_per_particle")  # a training begins
@@ -21,14 +21,14 @@ KNOWN_BEFORE = ("init_seed", "num_parameters", "flops_per_particle")  # a traini
 
 @dataclass(frozen=True, kw_only=True)
 class TrialRecord:
-    """What is known of one training.
+    """The record of one training.
 
     Attributes:
         id: Name of its folder.
-        stage: "closed_form", "initialization", "random", "adaptive", "finalists" or "train".
+        stage: Name of the stage that it belongs to, or "train" for `cconv train`.
         parameters: Hyperparameters that were drawn.
         config: Resolved network and training settings, seeds, number of parameters.
-        log: One entry an evaluation: updates, train_loss, valid_error, learning_rate, seconds, diverged.
+        log: One entry for each evaluation: updates, train_loss, valid_error, learning_rate, seconds, diverged.
         outcome: One of `OUTCOMES`; "interrupted" if the run ended before the trial did.
         reason: Why it failed, or "".
     """
@@ -43,17 +43,17 @@ class TrialRecord:
 
     @property
     def is_closed_form(self) -> bool:
-        """Whether least squares found it, so that no seed was drawn."""
+        """True if the model was fitted by least squares, without a seed."""
         return self.config.get("closed_form", False)
 
     @property
     def best(self) -> float:
-        """Smallest validation error of the log, that of the checkpoint; infinity where there is none."""
+        """Smallest validation error of the log, the error of the checkpoint; infinity if there is none."""
         finite = (entry["valid_error"] for entry in self.log)
         return min((error for error in finite if error is not None), default=math.inf)
 
     def error_at(self, updates: int) -> float | None:
-        """Validation error after a number of updates; None if it was not measured there or not finite."""
+        """Return the validation error after a number of updates; None if it was not measured or is not finite."""
         return next((entry["valid_error"] for entry in self.log if entry["updates"] == updates), None)
 
     @property
@@ -83,7 +83,7 @@ class TrialFolder:
 
     @property
     def started(self) -> bool:
-        """Whether the configuration has been written."""
+        """True if the configuration has been written."""
         return (self.path / "config.json").is_file()
 
     @property
@@ -101,13 +101,13 @@ class TrialFolder:
             )
 
     def start(self, config: Mapping) -> None:
-        """Begin an empty log, then write the configuration, by which a reader knows that there is a trial."""
+        """Begin an empty log, then write the configuration; its file marks the trial as started."""
         self.path.mkdir(parents=True, exist_ok=True)
         (self.path / "log.jsonl").write_text("")
         write_json(self.path / "config.json", config)
 
     def go_on(self, updates: int) -> None:
-        """Drop what was logged after `updates`, from where the training goes on."""
+        """Drop the entries of the log after `updates`, where the training continues."""
         kept = [entry for entry in self.log() if entry["updates"] <= updates]
         write_text(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in kept))
 
@@ -117,17 +117,17 @@ class TrialFolder:
             file.write(json.dumps(entry) + "\n")
 
     def finish(self, outcome: str, reason: str = "") -> None:
-        """Record how the trial ended; it does not go on from there."""
+        """Record the outcome of the trial, which is final."""
         self.progress.unlink(missing_ok=True)
         write_json(self.path / "outcome.json", {"outcome": outcome, "reason": reason})
 
     @property
     def ended(self) -> bool:
-        """Whether it is known how the trial ended."""
+        """True if the outcome of the trial is recorded."""
         return (self.path / "outcome.json").is_file()
 
     def log(self) -> list[dict]:
-        """Evaluations so far; a last line cut short by a kill is left out."""
+        """Read the evaluations so far, without a last line that a kill cut short."""
         path = self.path / "log.jsonl"
         lines = read_text(path).splitlines() if path.exists() else []
         if lines and not lines[-1].endswith("}"):
@@ -144,7 +144,7 @@ class TrialFolder:
         return entry
 
     def read(self) -> TrialRecord:
-        """Everything that was recorded.
+        """Read the whole record.
 
         Raises:
             DataError: If a file is damaged.
@@ -166,12 +166,12 @@ class TrialFolder:
 
 
 def identity(parameters: Mapping) -> str:
-    """What two configurations share only if their hyperparameters are the same."""
+    """Return a key that two configurations share only if their hyperparameters are the same."""
     return repr(sorted(parameters.items()))
 
 
 def count_outcomes(records: Sequence[TrialRecord]) -> dict[str, dict[str, int]]:
-    """Number of trials of each outcome, by stage."""
+    """Count the trials of each outcome, by stage."""
     stages = list(dict.fromkeys(record.stage for record in records))
     counts = {stage: Counter(record.outcome for record in records if record.stage == stage) for stage in stages}
     return {stage: {outcome: counts[stage][outcome] for outcome in OUTCOMES} for stage in stages}
