@@ -1,8 +1,8 @@
-"""Pairs of points within a cutoff, found in cells as wide as the cutoff, by compiled loops without Python's lock.
+"""Neighbour search with a cell list: pairs of points within a cutoff, by compiled loops without Python's lock.
 
-Only cells that hold a point are kept, sorted by their number: memory and time follow the points, however far some of
-them lie from the rest. Cells that follow each other along the last axis have numbers that do so too, so that a point
-finds its neighbours in a few runs of sorted points. Compiled code is cached on disk.
+Cells are as wide as the cutoff. Only cells that hold a point are kept, sorted by their number, so memory and time
+depend on the number of points, not on the extent of the domain. Adjacent cells along the last axis have consecutive
+numbers, so a point finds its neighbours in a few runs of consecutive sorted points. Compiled code is cached on disk.
 """
 
 import math
@@ -17,7 +17,7 @@ _compile = compile_cached(nogil=True, error_model="numpy")
 
 _MAX_CELLS = 2**20  # along an axis: numbers of cells in three dimensions fit 63 bits, with room for one more
 _MARGIN = 1 + 1e-6  # of a cell's width over the cutoff, well above the rounding of coordinates counted in cells
-_SAMPLE = 1000  # points that tell where the middle of all is
+_SAMPLE = 1000  # number of points that estimate the middle of all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Cells:
 
 @dataclass(frozen=True, kw_only=True)
 class CellGrid:
-    """Where cells lie. Axes that the points do not have come first, with one cell.
+    """The positions of the cells. Axes that the points do not have come first, with one cell.
 
     Attributes:
         cutoff: Largest distance of a pair, inclusive.
@@ -57,7 +57,7 @@ class CellGrid:
     def around(cls, points: np.ndarray, cutoff: float, lengths: np.ndarray) -> "CellGrid":
         """Cells around the middle of points (N, D); open axes have all cells that can be numbered.
 
-        Points beyond these count as in the outermost ones, which costs time only.
+        Points beyond these are put into the outermost cells, which only costs time.
 
         Args:
             points: Coordinates; along periodic axes from 0 to the length.
@@ -87,7 +87,7 @@ class CellGrid:
 def pairs_by_receiver(
     receivers: Cells, senders: Cells, grid: CellGrid, include_self: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs within the cutoff in compressed rows by receiver, senders ascending within a row.
+    """Find the pairs within the cutoff in compressed rows by receiver, senders ascending within a row.
 
     Args:
         receivers: Receiving points.
@@ -100,11 +100,11 @@ def pairs_by_receiver(
     """
     skips_self = receivers is senders and not include_self
     found = _find(*_arrays(senders), *_arrays(receivers), grid.counts, grid.lengths, grid.cutoff, skips_self)
-    return _turn_round(*found, len(receivers.order))
+    return _transpose(*found, len(receivers.order))
 
 
 def half_pairs(points: Cells, grid: CellGrid) -> np.ndarray:
-    """Pairs of different points within the cutoff, each listed once: (P, 2), int64."""
+    """Find the pairs of different points within the cutoff, each listed once: (P, 2), int64."""
     arrays = _arrays(points)
     return _listed_once(*_find(*arrays, *arrays, grid.counts, grid.lengths, grid.cutoff, True))
 
@@ -115,7 +115,7 @@ def _arrays(cells: Cells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @_compile
 def separations(to, origin, row_splits, senders, lengths):
-    """Minimum-image displacement of each pair (E, D) from the sender's `origin` to the receiver's `to`, and its length.
+    """Return minimum-image displacement (E, D) and distance of each pair, from the sender's `origin` to the receiver.
 
     In the dtype of the points, rounded as `Box.displacement` does; `lengths` (D,) are infinite along open axes.
     """
@@ -166,10 +166,10 @@ def _columns(points, order):
 
 
 @_compile
-def _beside(cell, count):
-    """First and last cells at and beside `cell` along an axis, in two ranges; the first of them may be empty.
+def _adjacent_cells(cell, count):
+    """Return the cells at and adjacent to `cell` along an axis as two ranges; the first of them may be empty.
 
-    At its ends, which points reach on periodic axes only, an axis goes on at the other end.
+    At the ends of an axis the range wraps around. Points reach the ends on periodic axes only.
     """
     if count <= 3:
         return 0, -1, 0, count - 1
@@ -181,8 +181,8 @@ def _beside(cell, count):
 
 
 @_compile
-def _place(numbers, number, hint):
-    """First place in ascending `numbers` of one that is not below `number`, soonest found just behind `hint`."""
+def _lower_bound(numbers, number, hint):
+    """Return the lower bound of `number` in the ascending `numbers`, by a galloping search from `hint`."""
     low = hint if hint == 0 or numbers[hint - 1] < number else 0
     high, step = low, 1
     while high < len(numbers) and numbers[high] < number:
@@ -201,12 +201,12 @@ def _place(numbers, number, hint):
 
 @_compile
 def _runs_around(number, numbers, counts, runs):
-    """Set `runs` (R, 2) to the places of the points at and beside a cell, in runs of which some may be empty.
+    """Set `runs` (R, 2) to the index ranges of the points in a cell and its neighbours; some may be empty.
 
-    What `runs` holds before is where the search begins. Returns the numbers of runs and of points.
+    The search starts at the previous content of `runs`. Returns the numbers of runs and of points.
     """
     x, y, z = number // counts[2] // counts[1], number // counts[2] % counts[1], number % counts[2]
-    xs, ys, zs = _beside(x, counts[0]), _beside(y, counts[1]), _beside(z, counts[2])
+    xs, ys, zs = _adjacent_cells(x, counts[0]), _adjacent_cells(y, counts[1]), _adjacent_cells(z, counts[2])
     count = num_points = 0
     for x_range in range(0, 4, 2):
         for y_range in range(0, 4, 2):
@@ -215,8 +215,8 @@ def _runs_around(number, numbers, counts, runs):
                     row = (i * counts[1] + j) * counts[2]
                     for z_range in range(0, 4, 2):
                         if zs[z_range] <= zs[z_range + 1]:
-                            runs[count, 0] = _place(numbers, row + zs[z_range], runs[count, 0])
-                            runs[count, 1] = _place(numbers, row + zs[z_range + 1] + 1, runs[count, 0])
+                            runs[count, 0] = _lower_bound(numbers, row + zs[z_range], runs[count, 0])
+                            runs[count, 1] = _lower_bound(numbers, row + zs[z_range + 1] + 1, runs[count, 0])
                             num_points += runs[count, 1] - runs[count, 0]
                             count += 1
     return count, num_points
@@ -224,7 +224,7 @@ def _runs_around(number, numbers, counts, runs):
 
 @_compile
 def _with_room(array, used, size):
-    """The array, or a larger copy of its first `used` members where it has not `size`."""
+    """Return the array, or a larger copy of its first `used` members if it is shorter than `size`."""
     if size <= len(array):
         return array
     larger = np.empty(2 * size, array.dtype)
@@ -246,10 +246,10 @@ def _copy_runs(runs, points, order, near, near_order):
 
 @_compile
 def _append_close(x, y, z, near, near_order, lengths, squared_cutoff, skipped, squared, found, num_found):
-    """Append to `found` which of the points `near` lie within the cutoff of (x, y, z); returns how many it then has."""
+    """Append to `found` the points of `near` within the cutoff of (x, y, z); returns the new length of `found`."""
     length_x, length_y, length_z = lengths[0], lengths[1], lengths[2]
     count = uintp(len(near_order))
-    for j in range(count):  # in a loop of its own, so that it works on several points at a time
+    for j in range(count):  # in a loop of its own, so that the compiler vectorises it
         dx, dy, dz = abs(x - near[0, j]), abs(y - near[1, j]), abs(z - near[2, j])
         dx, dy, dz = min(dx, length_x - dx), min(dy, length_y - dy), min(dz, length_z - dz)
         squared[j] = dx * dx + dy * dy + dz * dz
@@ -261,7 +261,7 @@ def _append_close(x, y, z, near, near_order, lengths, squared_cutoff, skipped, s
 
 @_compile
 def _find(numbers, points, order, other_numbers, others, other_order, counts, lengths, cutoff, skips_self):
-    """Others within the cutoff of each point, in rows of no particular order: their first and last places, and they."""
+    """Find the other points within the cutoff of each point: first and last index of each row, and unsorted rows."""
     starts, ends = np.zeros(len(order), np.int64), np.zeros(len(order), np.int64)
     found, num_found = np.empty(32 * len(order), np.int32), uintp(0)
     near, near_order, squared = np.empty((3, 0)), np.empty(0, np.int32), np.empty(0)
@@ -293,8 +293,8 @@ def _find(numbers, points, order, other_numbers, others, other_order, counts, le
 
 
 @_compile
-def _turn_round(starts, ends, found, num_rows):
-    """Rows of what each point found turned into rows of who found each point, ascending within a row."""
+def _transpose(starts, ends, found, num_rows):
+    """Transpose the rows: from the points that each point found to the points that found each point, ascending."""
     splits = np.zeros(num_rows + 1, np.int64)
     for j in range(len(starts)):
         for place in range(uintp(starts[j]), uintp(ends[j])):
@@ -316,7 +316,7 @@ def _turn_round(starts, ends, found, num_rows):
 
 @_compile
 def _listed_once(starts, ends, found):
-    """Pairs of a point with those that it found and that come before it."""
+    """List the pairs of a point with the found points that come before it."""
     count = 0
     for j in range(len(starts)):
         for place in range(starts[j], ends[j]):

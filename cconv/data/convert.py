@@ -1,4 +1,4 @@
-"""Any data set in our own layout."""
+"""Conversion of any data set to the LagrangeBench layout with our extra members."""
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -16,12 +16,12 @@ def convert(
 ) -> None:
     """Write a data set in the LagrangeBench layout with our extras.
 
-    Each split becomes a file and each of its blocks a trajectory; the scene, what was given for it and what is missing
-    are kept.
+    Each split becomes a file and each of its blocks a trajectory. The scene, the values given by the user and the list
+    of missing facts are kept.
 
     Args:
-        dataset: What to write.
-        folder: Where to write.
+        dataset: The data set to write.
+        folder: Folder to write.
         overwrite: Whether an older data set in `folder` may be replaced.
         progress: Wraps the trajectories of a split to show progress, given a label.
 

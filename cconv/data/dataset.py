@@ -1,4 +1,4 @@
-"""One object for every data set: a scene, splits, trajectories read when they are asked for."""
+"""The data set: a scene, splits, and trajectories that are read when they are asked for."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -20,9 +20,9 @@ class Dataset:
     Attributes:
         path: Folder of the data.
         format: "LagrangeBench" or "DeepLagrangianFluids".
-        scene: What all trajectories share.
+        scene: Facts that all trajectories share.
         splits: Blocks of "train", "valid" and "test".
-        metadata: What else the data say about themselves, as stored.
+        metadata: Further stored facts about the data.
         source: Reads the files.
     """
 
@@ -34,7 +34,7 @@ class Dataset:
     source: TrajectorySource
 
     def trajectory(self, split: str, k: int) -> Trajectory:
-        """Block `k` of a split, read from its files.
+        """Read block `k` of a split from its files.
 
         Raises:
             DataError: If there is no such split or block, or the files are damaged.
@@ -50,7 +50,7 @@ class Dataset:
         return self.source.read(*blocks[k])
 
     def trajectories(self, split: str) -> Iterator[Trajectory]:
-        """All blocks of a split, one at a time."""
+        """Yield all blocks of a split, one at a time."""
         return (self.trajectory(split, k) for k in range(len(self.splits[split])))
 
     def frames(self, split: str) -> Iterator[tuple[Trajectory, int]]:
@@ -92,7 +92,7 @@ def open_dataset(
 
     Args:
         path: Folder of the data.
-        mass: Mass of every particle; None takes what the data say. So do the next three.
+        mass: Mass of every particle; None takes the value of the data, as for the next three arguments.
         particle_spacing: Initial distance of neighbouring particles, dx.
         frame_dt: Time between stored frames.
         force: Constant external acceleration, D numbers.
@@ -149,7 +149,7 @@ def _splits(
     if set(stored) == set(SPLITS):
         return stored
     if stored:
-        # Published DeepLagrangianFluids sets have no test split: validation gives a part of its own.
+        # Published DeepLagrangianFluids sets have no test split: a part of the validation split becomes the test split.
         valid, test = _split_names(source, source.stored_splits["valid"], fractions[1:], gap, seed, folder)
         return {"train": stored["train"], "valid": valid, "test": test}
     return dict(zip(SPLITS, _split_names(source, source.names, fractions, gap, seed, folder), strict=True))

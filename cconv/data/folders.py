@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Atomic writing of files and folders: they appear complete or not at all."""
 
 import os
 import re
@@ -13,7 +13,7 @@ from cconv.files import replacing
 
 @contextmanager
 def whole_file(file: Path) -> Iterator[Path]:
-    """A temporary name beside `file` with its suffix, renamed to it when all is written, removed if anything fails.
+    """Give a temporary name beside `file`, which is renamed to it when complete and removed if anything fails.
 
     Raises:
         ConfigError: If the file cannot be written.
@@ -27,10 +27,10 @@ def whole_file(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterator[Path]:
-    """A temporary folder beside `folder`, renamed to it when all is written and removed if anything fails.
+    """Give a temporary folder beside `folder`, which is renamed to it when complete and removed if anything fails.
 
     Args:
-        folder: Where the files shall be; may exist if it is empty.
+        folder: Folder of the files; it may exist if it is empty.
         files: Names that will be written. With `overwrite` a folder with nothing else in it is replaced.
         overwrite: Whether an older data set may be replaced.
 
@@ -46,7 +46,7 @@ def whole_folder(folder: Path, files: Iterable[str], overwrite: bool) -> Iterato
         _replace(folder, partial)
         _remove_left_behind(folder)
     except OSError as error:
-        reason = " ".join(str(error.strerror or error).split())  # HDF5 tells in several lines
+        reason = " ".join(str(error.strerror or error).split())  # HDF5 errors have several lines
         raise ConfigError(f"{folder}: cannot be written ({reason}); name another folder.") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -66,7 +66,7 @@ def check_free(folder: Path, files: Iterable[str], overwrite: bool) -> None:
 
 
 def _remove_left_behind(folder: Path) -> None:
-    """Delete what processes that were killed had written of the same folder."""
+    """Delete the temporary folders that killed processes left for the same folder."""
     left = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.partial(\.old)?")
     for path in folder.parent.iterdir():
         match = left.fullmatch(path.name)

@@ -1,7 +1,7 @@
-"""Data sets of scenes, computed by the solver, in the LagrangeBench layout with our extra members.
+"""Generation of data sets: the solver computes scenes in the LagrangeBench layout with our extra members.
 
-Finished trajectories wait in a folder beside the one to write until all are there, so that a run that was killed goes
-on where it stopped.
+Finished trajectories are kept in a folder beside the one to write until all are done, so that a killed run continues
+where it stopped.
 """
 
 import hashlib
@@ -32,16 +32,16 @@ from cconv.files import held
 from cconv.scenes.simulated_scene import SimulatedScene
 
 Progress = Callable[[Iterable, str], Iterable]
-SPLIT_FRACTIONS = (0.5, 0.25, 0.25)  # as LagrangeBench
+SPLIT_FRACTIONS = (0.5, 0.25, 0.25)  # as in LagrangeBench
 _REQUEST, _LOCK, _WRITING, _SUFFIX, _PARTIAL = "request.json", "lock", "writing", ".safetensors", ".partial"
 
 
 class Generated(NamedTuple):
-    """What `generate` did.
+    """The result of `generate`.
 
     Attributes:
         reused: Trajectories that an earlier run had finished.
-        failures: One line for every start that blew up and was replaced by another.
+        failures: One line for every simulation that blew up and was replaced by one with another initial state.
     """
 
     reused: int
@@ -62,16 +62,16 @@ def generate(
     """Write trajectories of a scene, split 2:1:1 into train, valid and test files; a single one is cut in time.
 
     The same scene, seed and numbers give the same bytes, however many workers. A run that is killed leaves the
-    trajectories that it finished in ``FOLDER.unfinished``; the same call goes on from there, also with another number
-    of them. In a script, several workers need the call to stand under ``if __name__ == "__main__":``.
+    trajectories that it finished in ``FOLDER.unfinished``; the same call continues from there, also with another
+    number of trajectories. In a script, several workers need the call to stand under ``if __name__ == "__main__":``.
 
     Args:
-        scene: What to compute.
-        folder: Where to write.
+        scene: Scene to compute.
+        folder: Folder to write.
         num_trajectories: 1, or at least 3; the scene's own number by default.
         num_frames: Frames of each, the start included; the scene's own number by default.
-        seed: Seed of the starts.
-        workers: Processes side by side; as many as there are cores by default.
+        seed: Seed of the initial states.
+        workers: Number of processes; by default one for each core.
         overwrite: Whether an older data set in `folder`, or unfinished ones with other settings, may be replaced.
         progress: Wraps the frames to show progress, given a label.
 
@@ -93,7 +93,7 @@ def generate(
         workers = max(1, min(workers or available_cores(), len(calls)))
         for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
             pass
-        (unfinished / _WRITING).touch()  # what is in the folder from now on is ours
+        (unfinished / _WRITING).touch()  # from now on the content of the folder is ours
         write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), may_replace)
         failures = tuple(line for file in files for line in _facts(file)["failures"])
         shutil.rmtree(unfinished)
@@ -114,7 +114,7 @@ def _check_numbers(num_trajectories: int, num_frames: int, workers: int | None) 
 
 
 class _Frames:
-    """Computes trajectories, side by side where there are several workers; yields about once for every frame done."""
+    """Iterator that computes trajectories with several workers, and yields about once for every frame."""
 
     def __init__(self, calls: list[tuple], frames_per_call: int, workers: int):
         self._calls, self._total, self._workers = calls, len(calls) * frames_per_call, workers
@@ -129,12 +129,12 @@ class _Frames:
             else (frame for call in self._calls for frame in _compute(*call))
         )
         for number, _ in enumerate(frames):
-            if number < self._total:  # starts that blew up are computed again, but not counted
+            if number < self._total:  # simulations that blew up are computed again, but not counted
                 yield
 
 
 def _compute(scene: SimulatedScene, num_frames: int, seed: int, index: int, file: Path) -> Iterator[None]:
-    """Compute a trajectory and save it, whole or not at all."""
+    """Compute a trajectory and save it atomically."""
     simulation = yield from simulate(scene, num_frames, seed, index)
     partial = file.with_suffix(_PARTIAL)
     try:
@@ -152,13 +152,13 @@ def _compute(scene: SimulatedScene, num_frames: int, seed: int, index: int, file
 
 
 def _facts(file: Path) -> dict:
-    """What is stored beside the tensors: viscosity and failures."""
+    """Return the facts stored beside the tensors: viscosity and failures."""
     with safe_open(file, framework="pt") as stored:
         return json.loads(stored.metadata()["facts"])
 
 
 def _is_whole(file: Path) -> bool:
-    """Whether an earlier run finished the trajectory; a file that a crash of the machine cut short is none."""
+    """Tell whether an earlier run finished the trajectory; a file cut short by a crash does not count."""
     try:
         return bool(_facts(file))
     except (OSError, SafetensorError):
@@ -173,7 +173,7 @@ def _load(file: Path) -> Simulation:
 
 
 def _request(scene: SimulatedScene, num_frames: int, seed: int) -> dict:
-    """What trajectories depend on, but for their number: settings, seed and the code that computes them."""
+    """Return everything that trajectories depend on, except their number: settings, seed and code."""
     settings = {"scene": scene.name, **asdict(scene), "num_trajectories": None, "num_frames": num_frames, "seed": seed}
     modules = sorted(file for folder in (sph, scenes) for file in Path(folder.__path__[0]).glob("*.py"))
     code = hashlib.sha256(b"".join(file.read_bytes() for file in modules)).hexdigest()
@@ -199,7 +199,7 @@ def _unfinished_folder(unfinished: Path, request: dict, overwrite: bool) -> Iter
 
 
 def _prepare(unfinished: Path, request: dict, overwrite: bool) -> None:
-    """Keep what belongs to the request; delete what belongs to another only if it may be overwritten."""
+    """Keep the files of the request; delete those of another request only if they may be overwritten."""
     files = [file for file in unfinished.iterdir() if file.name != _LOCK]
     if files and _read(unfinished / _REQUEST) != request:
         others = [

@@ -1,4 +1,4 @@
-"""What a data set holds, as plain facts, and what of it does not make sense."""
+"""Plain facts about a data set, and its implausibilities."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -26,7 +26,7 @@ def inspect_dataset(
     Every trajectory is read, so damaged data are found. Lengths and times are in the units of the data.
 
     Args:
-        dataset: What to look at.
+        dataset: The data set.
         cutoff: Radius of the neighbour counts; None means twice the particle spacing.
         progress: Wraps the trajectories of a split to show progress, given a label.
 

@@ -1,4 +1,4 @@
-"""How much foreign data may take: memory, and text that a terminal shows."""
+"""Limits for foreign data: memory, and text shown in a terminal."""
 
 import psutil
 
@@ -32,7 +32,7 @@ def check_size(size: int, stored: int, place: str) -> None:
 
 
 def memory_limit() -> int:
-    """Bytes that one piece of data may take now."""
+    """Return the number of bytes that one piece of data may take now."""
     return int(MEMORY_SHARE * psutil.virtual_memory().available)
 
 

@@ -1,6 +1,6 @@
-"""metadata.json of the LagrangeBench layout: what it says about a scene, and what we write there.
+"""metadata.json of the LagrangeBench layout: reading the facts of a scene from it, and writing them.
 
-The key ``cconv`` keeps what the layout has no place for: name, force, where masses come from, what was missing.
+The key ``cconv`` keeps facts that the layout has no place for: name, force, where masses come from, what was missing.
 
 Source: Toshev et al. (2023), LagrangeBench: A Lagrangian Fluid Mechanics Benchmarking Suite, and its data sets.
 """
@@ -45,7 +45,7 @@ def load_metadata(file: Path) -> dict:
 
 
 def default_mass(particle_spacing: float, dim: int) -> float:
-    """Mass of a particle where none is stored: rest density 1 times ``dx ** D``."""
+    """Return the mass of a particle if none is stored: rest density 1 times ``dx ** D``."""
     return particle_spacing**dim
 
 
@@ -57,7 +57,7 @@ def default_mass_source(particle_spacing: float, dim: int) -> str:
 def scene_from_metadata(
     metadata: Mapping, file: Path, given: Given, *, stores_velocity: bool, stores_mass: bool, has_boundary: bool
 ) -> Scene:
-    """The scene that metadata.json, the members of the files and the user describe together; the user is right.
+    """Build the scene from metadata.json, the members of the files and the user's values, which take precedence.
 
     Args:
         metadata: What is stored.
@@ -94,7 +94,7 @@ def scene_from_metadata(
 
 
 def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> dict:
-    """What metadata.json says about a scene, complete for LagrangeBench.
+    """Build the metadata.json of a scene, complete for LagrangeBench.
 
     Args:
         scene: The scene.

@@ -1,7 +1,7 @@
-"""Whether particle data make sense: what can be read and still is no simulation of a fluid.
+"""Plausibility of particle data: find data that can be read but do not look like a simulation of a fluid.
 
-Files that cannot be what they claim are refused by their readers. Here is what is only suspicious: each finding names
-the trajectory, the frame and the particle that show it first, and what to do.
+Readers refuse damaged files. This module reports what is only suspicious: each finding names the first trajectory,
+frame and particle with the problem, and what to do.
 """
 
 import math
@@ -30,15 +30,15 @@ AT_REST = 1e-4  # length of a step, in particle spacings
 
 @dataclass(frozen=True, kw_only=True)
 class DataFinding:
-    """Something in a trajectory that does not make sense.
+    """An implausibility in a trajectory.
 
     Attributes:
         check: Name of the check that found it.
-        trajectory: Name of the trajectory that shows it first.
-        frame: Stored number of the frame that shows it first.
-        particle: Stored number of a particle that shows it; None where it holds for all.
-        text: What was found and what to do.
-        others: How many other trajectories, or blocks of one, show it.
+        trajectory: Name of the first trajectory with the problem.
+        frame: Stored number of the first frame with the problem.
+        particle: Stored number of a particle with the problem; None if it concerns all.
+        text: The problem and what to do.
+        others: Number of other trajectories, or blocks of one, with the problem.
     """
 
     check: str
@@ -61,10 +61,10 @@ class DataFinding:
 def dataset_findings(
     dataset: Dataset, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
 ) -> list[DataFinding]:
-    """What does not make sense in a data set; every trajectory of every split is read, one at a time.
+    """Find the implausibilities of a data set; every trajectory of every split is read, one at a time.
 
     Args:
-        dataset: What to look at.
+        dataset: The data set.
         progress: Wraps the blocks of all splits to show progress, given a label.
 
     Raises:
@@ -84,7 +84,7 @@ def first_of_each(findings: Sequence[DataFinding]) -> list[DataFinding]:
 
 
 def trajectory_findings(trajectory: Trajectory, scene: Scene) -> list[DataFinding]:
-    """What does not make sense in the fluid of a trajectory, at most one finding a check."""
+    """Find the implausibilities in the fluid of a trajectory, at most one for each check."""
     fluid = (trajectory.particle_types == ParticleType.FLUID).nonzero()[:, 0]
     if len(fluid) == 0:
         return []

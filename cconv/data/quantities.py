@@ -1,4 +1,4 @@
-"""What a frame's particles can be coloured by or exported with."""
+"""Quantities of the particles of a frame, for colours and export."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from cconv.sph.operators import density
 
 
 def speed(frame: Frame) -> Tensor:
-    """Length of each particle's velocity (N,), length per time."""
+    """Return the magnitude of each particle's velocity (N,), length per time."""
     return torch.linalg.vector_norm(frame.velocities, dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Generators that run in processes of their own, side by side.
+"""Parallel execution of generators, each in a process of its own.
 
 Parent and workers share nothing but pipes, which end with them. A queue, counter or event of multiprocessing is made of
 semaphores with names, which stay in shared memory where all processes are killed at once.
@@ -19,7 +19,7 @@ from cconv.errors import DataError
 
 
 def available_cores() -> int:
-    """Cores that this process may use; all of the machine where the system does not tell."""
+    """Return the number of cores that this process may use; if unknown, all cores of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -101,7 +101,7 @@ def _work(connection: Connection, generator: Callable, threads: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process, whatever it computes, when its parent is gone."""
+    """End this process when its parent has died."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # this runs in workers alone
     parent.join()

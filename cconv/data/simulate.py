@@ -1,4 +1,4 @@
-"""One trajectory of a scene, computed by the solver: what data sets store of it."""
+"""Simulation of one trajectory of a scene with the solver, as data sets store it."""
 
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Simulation:
         particle_types: (N,), int64.
         masses: (N,), float32.
         viscosity: Kinematic viscosity ν.
-        failures: One line for every start that blew up before this one.
+        failures: One line for every earlier attempt that blew up.
     """
 
     positions: Tensor
@@ -37,10 +37,10 @@ class Simulation:
 
 
 def simulate(scene: SimulatedScene, num_frames: int, seed: int, index: int) -> Generator[None, None, Simulation]:
-    """Trajectory `index` of a data set; where its start blows up, another is drawn. Yields after each frame.
+    """Simulate trajectory `index` of a data set; if it blows up, draw another initial state. Yields after each frame.
 
     Args:
-        scene: What to compute.
+        scene: Scene to compute.
         num_frames: Frames to store.
         seed: Seed of the data set; the same seed and index give the same bytes.
         index: Which trajectory.

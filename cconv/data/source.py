@@ -1,4 +1,4 @@
-"""What every reader of particle data offers, what the user may say about data, and the checks that readers share."""
+"""The interface of readers of particle data, the values that users may override, and checks that readers share."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ SMALLEST, LARGEST = 1e-12, 1e12  # of a length, time, mass or acceleration, what
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What the user says about data, in their units; None takes what the data say.
+    """Values that the user gives in place of those of the data, in their units; None keeps the value of the data.
 
     Attributes:
         mass: Mass of every particle.
@@ -57,11 +57,11 @@ class TrajectorySource(Protocol):
 
     Attributes:
         format: Name of the layout.
-        scene: What all trajectories share.
-        metadata: What else the data say about themselves, as stored; empty if nothing.
+        scene: Facts that all trajectories share.
+        metadata: Further stored facts about the data; empty if there are none.
         files: The data files, in a fixed order.
         names: Names of all trajectories; unique, stored split first where there is one ("train/00000").
-        stored_splits: Names by split, as files or folders say; empty where they say nothing.
+        stored_splits: Names by split, if files or folders define splits; else empty.
     """
 
     format: str
@@ -79,7 +79,7 @@ class TrajectorySource(Protocol):
 
 
 def uniform_masses(mass: float, like: Tensor) -> Tensor:
-    """The same mass for each of N particles, (N,), with dtype and device of positions (T, N, D)."""
+    """Return the same mass for each of N particles, (N,), with dtype and device of positions (T, N, D)."""
     return torch.full((like.shape[1],), mass, dtype=like.dtype, device=like.device)
 
 

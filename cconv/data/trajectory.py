@@ -1,4 +1,4 @@
-"""What a reader returns: a scene, its trajectories, their frames."""
+"""The data that readers return: a scene, its trajectories, their frames."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class ParticleType(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Boundary:
-    """Points that stand for the walls of a scene.
+    """Points that represent the walls of a scene.
 
     Attributes:
         positions: (B, D), length.
@@ -36,7 +36,7 @@ class Boundary:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What all trajectories of a data set share. Lengths and times are in the units of the data.
+    """Facts that all trajectories of a data set share. Lengths and times are in the units of the data.
 
     Attributes:
         name: Short name of the scene.
@@ -48,7 +48,7 @@ class Scene:
         has_boundary: Whether there are wall points or wall particles.
         velocity_source: Where velocities come from: "stored" or "central differences of positions".
         mass_source: Where masses come from: "stored", or the value that stands in for them and why.
-        missing: One line for everything that the data lack and what was taken instead.
+        missing: One line for every fact that the data lack, with the default that replaces it.
     """
 
     name: str

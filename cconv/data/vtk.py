@@ -30,7 +30,7 @@ def write_vtk(
 
     Args:
         folder: Where to write.
-        trajectory: What to write.
+        trajectory: The trajectory to write.
         scene: Scene of the trajectory.
         frames: Indices of frames within the trajectory.
         overwrite: Whether older VTK files of the scene in `folder` may be replaced.

@@ -1,4 +1,4 @@
-"""Models on disk: safetensors, config.json and card.json. Nothing is ever unpickled."""
+"""Saved models: safetensors, config.json and card.json. Loading never unpickles anything."""
 
 import json
 import os
@@ -23,7 +23,7 @@ LARGEST_HEADER = 2**20  # bytes of a weights file's list of contents
 
 
 class _Card(OpenModel):
-    """What others read of a card."""
+    """The values of a card that other code reads."""
 
     data: dict = {}
     data_seed: Seed = 0
@@ -33,8 +33,8 @@ class _Card(OpenModel):
 def save_model(model: Model, folder: Path | str, card: dict) -> None:
     """Write a model: `model.safetensors`, `config.json`, `card.json`.
 
-    The files are written to a temporary folder that then takes the place of `folder`, or that of its files one by one
-    where it exists, so that a reader finds a whole model also after a kill at any time.
+    The files are written to a temporary folder, which is then renamed to `folder`; if that exists, its files are
+    replaced one by one. So a reader finds a complete model even after a kill at any time.
 
     Args:
         model: Model to save.
@@ -59,11 +59,11 @@ def save_model(model: Model, folder: Path | str, card: dict) -> None:
 
 
 def load_model(path: Path | str, task: str | None = None) -> Model:
-    """Model from a folder that `save_model` wrote.
+    """Load a model from a folder that `save_model` wrote.
 
     Args:
         path: Folder with `model.safetensors` and `config.json`.
-        task: Task that the model must be for, or None for any.
+        task: Required task of the model; None allows any.
 
     Raises:
         ConfigError: If files are missing, damaged or do not belong together, or the model is for another task.
@@ -98,7 +98,7 @@ def _read_config(path: Path) -> ModelConfig:
 
 
 def _read_weights(folder: Path, config: ModelConfig) -> dict[str, Tensor]:
-    """The weights of a model, whose names and shapes are compared before any of them is read."""
+    """Read the weights of a model, after a check of their names and shapes."""
     path = folder / WEIGHTS
     wanted = _shapes(config)
     try:
@@ -123,7 +123,7 @@ def _read_weights(folder: Path, config: ModelConfig) -> dict[str, Tensor]:
 
 
 def _shapes(config: ModelConfig) -> dict[str, tuple]:
-    """Shape and type of every tensor of a model's weights."""
+    """Return shape and type of every tensor of a model's weights."""
     return {name: (tuple(tensor.shape), "F32") for name, tensor in without_weights(config).state_dict().items()}
 
 
@@ -134,7 +134,7 @@ def _check_numbers(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def read_card(path: Path | str) -> dict:
-    """Metrics and provenance of a saved model; empty if it has none.
+    """Read metrics and provenance of a saved model; empty if it has none.
 
     Raises:
         ConfigError: If the card is damaged.

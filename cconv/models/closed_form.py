@@ -1,4 +1,4 @@
-"""The closed form: models of a single layer are linear in their coefficients, which least squares finds in seconds."""
+"""The closed form of a single layer, which is linear in its coefficients, so that least squares finds them."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -28,12 +28,12 @@ class NormalEquations:
         self._projections = torch.zeros(num_terms, num_outputs, dtype=torch.float64)
 
     def add(self, terms: Float[Tensor, "R P"], targets: Float[Tensor, "R C"]) -> None:
-        """Take in terms (R, P) and targets (R, C)."""
+        """Add terms (R, P) and targets (R, C) to the equations."""
         self._products.addmm_(terms.T, terms)
         self._projections.addmm_(terms.T, targets)
 
     def solve(self, ridge: float) -> Float[Tensor, "P C"]:
-        """Coefficients (P, C) that minimise the mean squared error + ``ridge`` · mean square of a term · |c|².
+        """Return the coefficients (P, C) that minimise mean squared error + ``ridge`` · mean square of a term · |c|².
 
         Raises:
             ConfigError: If the equations cannot be solved, e.g. for dependent terms without ridge.
@@ -70,9 +70,9 @@ def fit_closed_form(
         task: "density_rate" or "density_gradient".
         network: Settings of the layer: message, cutoff, window, mapping ...; by default 16 radial terms on differences
             to the neighbours within the support of the kernel.
-        features: Features of the task that the layer takes; None for all.
+        features: Names of the features of the task that are inputs of the layer; None for all.
         kernel: SPH kernel of the target.
-        smoothing_length: Its h, length; None for the particle spacing.
+        smoothing_length: Smoothing length h of the kernel; None for the particle spacing.
         ridge: Weight of the squared coefficients, in mean squares of a term.
         progress: Wraps the frames of the last pass, e.g. with a progress bar.
 

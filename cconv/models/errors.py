@@ -1,4 +1,4 @@
-"""Errors of a model on samples, and those of the trivial model that always predicts the mean."""
+"""Errors of a model on samples, and of the trivial model that always predicts the mean."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -35,12 +35,12 @@ class FrameError:
 
 @torch.no_grad()
 def frame_errors(model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> list[FrameError]:
-    """Errors of a model on each frame.
+    """Compute the errors of a model on each frame.
 
     Args:
         model: The model.
         samples: Frames with targets.
-        geometry: Sample to geometry, e.g. a cache; by default computed afresh.
+        geometry: Function from a sample to its geometry, e.g. a cache; by default it is computed anew.
     """
     geometry = geometry or (lambda sample: model.geometry(sample.inputs))
     errors = []
@@ -51,10 +51,10 @@ def frame_errors(model: Model, samples: Iterable[Sample], geometry: Callable | N
 
 
 def mean_predictor_error(samples: Iterable[Sample], train_samples: Iterable[Sample]) -> list[FrameError]:
-    """Errors, on each frame, of predicting the mean of the training split everywhere.
+    """Compute the error on each frame of predicting the mean of the training split everywhere.
 
-    By definition `normalized_mse` of them is 1 on the training split. On another split it is what a model must be below
-    to know anything: more than 1 where that split moves more than the training split, less where it is calmer.
+    Their `normalized_mse` is 1 on the training split by definition. On another split it is larger if the target varies
+    more than in the training split, and smaller if it varies less. A useful model is well below it.
 
     Args:
         samples: Frames of a split.

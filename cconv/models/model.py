@@ -1,4 +1,4 @@
-"""A model: a task, a network that answers it, and the standardisation of its features and target."""
+"""A model: a task, a network that predicts its target, and the standardisation of features and target."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -32,9 +32,9 @@ class ModelConfig(StrictModel):
     """Everything that rebuilds a model except its weights; stored as `config.json`.
 
     The network computes in particle spacings, rest densities and frame intervals (`cconv.tasks.features.Units`).
-    `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` is that of the training data,
-    for the record. `features` are those of the task that the model takes; `wall_scalars` and `wall_vectors` say what a
-    wall point carries, and are 0 where there is no branch for walls.
+    `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` is the spacing of the
+    training data, for the record. `features` names the features of the task that are inputs of the model.
+    `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     """
 
     task: str
@@ -54,30 +54,30 @@ class ModelConfig(StrictModel):
                 raise ValueError(f"`{what}` must be one of {', '.join(known)}, got {shown(name)}")
         TASKS[self.task].check_features(self.features)
         if (self.wall_scalars or self.wall_vectors) and WALLS not in self.features:
-            raise ValueError(f"a branch for walls needs the feature {WALLS!r}")
+            raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
         return self
 
     @property
     def fluid_features(self) -> tuple[str, ...]:
-        """Names of what the model takes of a fluid particle."""
+        """Names of the input features of a fluid particle."""
         return tuple(name for name in self.features if name != WALLS)
 
     @property
     def inputs(self) -> Kinds:
-        """What the model takes of a fluid particle."""
+        """Numbers of input features of a fluid particle."""
         return kinds_of(self.fluid_features)
 
     @property
     def walls(self) -> Kinds | None:
-        """What the model takes of a wall point; None without a branch for walls."""
+        """Numbers of input features of a wall point; None without a convolution of the walls."""
         kinds = Kinds(self.wall_scalars, self.wall_vectors)
         return kinds if any(kinds) else None
 
     @property
     def output(self) -> Kinds:
-        """What the model predicts."""
+        """Numbers of predicted scalars and vectors."""
         return TASKS[self.task].output
 
 
@@ -100,10 +100,10 @@ class FrameGeometry:
 
 
 class Model(nn.Module):
-    """Predicts what a task asks at the fluid particles of a frame.
+    """A model that predicts the target of a task at the fluid particles of a frame.
 
     Args:
-        config: What to build.
+        config: Configuration of the model.
         features: Standardisation of the fluid features that the model takes, from the training split.
         targets: Standardisation of the target, from the training split.
         generator: Source of the initial weights; None for torch's global one.
@@ -152,7 +152,7 @@ class Model(nn.Module):
         return self.task.kernel_at(particle_spacing, self.config.dim)
 
     def geometry(self, inputs: Inputs) -> FrameGeometry:
-        """Neighbours of a frame, and what the network reads of them.
+        """Compute the neighbours of a frame and the geometry that the network reads.
 
         Raises:
             ShapeError: If the frame has another dimension or other walls than the model.
@@ -172,7 +172,7 @@ class Model(nn.Module):
     def network_inputs(
         self, inputs: Inputs, geometry: FrameGeometry
     ) -> tuple[Float[Tensor, "N C_in"], Geometry, WallInputs[Geometry] | None]:
-        """What the network takes: standardised features of the fluid, its geometry, and the same of the walls."""
+        """Return the inputs of the network: standardised features and geometry of the fluid and of the walls."""
         flat = inputs.features.select(self.config.fluid_features).flat()
         features = (flat - self.feature_mean) / self.feature_scale
         arranged = self.settings.arrange(features, self.config.inputs, self.config.dim)
@@ -195,7 +195,7 @@ class Model(nn.Module):
         return self.predict(self.inputs(frame, scene))
 
     def inputs(self, frame: Frame, scene: Scene) -> Inputs:
-        """What the model is given of a frame of a data set: only the features that it takes are computed."""
+        """Compute the inputs of a frame of a data set, only the features that the model takes."""
         return self.task.inputs(frame, scene, self.config.features)
 
     def _check(self, inputs: Inputs) -> None:
@@ -227,9 +227,9 @@ def build_model(
     """A fresh model for a scene, standardised by its training samples only.
 
     Args:
-        network: What to build.
-        task: What is asked.
-        features: Features that the model takes among those of the task; the constant is always one of them.
+        network: Settings of the network.
+        task: Task of the model.
+        features: Names of the features of the task that are inputs; the constant is always one of them.
         scene: Scene of the samples.
         train_samples: Training split.
         generator: Source of the initial weights; None for torch's global one.
@@ -252,7 +252,7 @@ def build_model(
         wall_vectors=walls.vectors,
         network=network,
     )
-    # Shifted vectors would not turn with the scene, as all of an equivariant network does.
+    # Shifted vectors would break the rotation equivariance of the network.
     turns = network.is_equivariant
     taken = [sample.inputs.features.select(config.fluid_features) for sample in train_samples]
     center = network.has_intercept(config.output) and not (turns and config.output.vectors)
@@ -263,7 +263,7 @@ def build_model(
 
 
 def without_weights(config: ModelConfig) -> Model:
-    """A model without weights, which takes no memory, to see what it would have.
+    """Build a model without weights, which takes no memory, to see its size.
 
     Raises:
         ConfigError: If it would have more than `MOST_PARAMETERS` learned values.

@@ -31,7 +31,7 @@ def standardize_features(samples: Iterable[Features], center_vectors: bool = Tru
 
     Args:
         samples: Features of each frame.
-        center_vectors: Whether the mean of vectors is taken off; not for what must turn with the scene.
+        center_vectors: Whether the mean of vectors is subtracted; False for rotation-equivariant networks.
     """
     frames = list(samples)
     parts = []
@@ -51,7 +51,7 @@ def standardize_values(frames: Iterable[Float[Tensor, "N C"]], center: bool = Tr
 
     Args:
         frames: Tensors (N, C), one a frame.
-        center: Whether the mean is taken off; not for what must turn with the scene.
+        center: Whether the mean is subtracted; False for rotation-equivariant networks.
     """
     stacked = torch.cat([values.double() for values in frames])
     variance = stacked.var(dim=0, correction=0).mean()
@@ -61,5 +61,5 @@ def standardize_values(frames: Iterable[Float[Tensor, "N C"]], center: bool = Tr
 
 
 def unknown(kinds: Kinds, dim: int) -> Standardization:
-    """Room for the standardisation of so many scalars and vectors."""
+    """Make a placeholder for the standardisation of so many scalars and vectors."""
     return Standardization(torch.empty(kinds.num_values(dim)), torch.empty(kinds.num_values(dim)))

@@ -1,4 +1,4 @@
-"""Networks of continuous convolutions: who answers what a task asks."""
+"""Networks of continuous convolutions, which predict the target of a task."""
 
 from typing import Annotated, get_args
 

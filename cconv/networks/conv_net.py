@@ -55,14 +55,14 @@ class ConvNet(ConvolutionNetwork[ConvGeometry, ContinuousConv]):
 
     Layer 0 concatenates boundary convolution, fluid convolution and fully connected layer, each of `channels.layers[0]`
     outputs. Every further layer k adds a convolution and a fully connected layer of the activated output before it;
-    where the widths of z_k and z_{k-1} agree, z_{k-1} is added too. A network of one layer adds its branches instead
+    where the widths of z_k and z_{k-1} agree, z_{k-1} is added too. A network of one layer adds these parts instead
     of concatenating them. The last layer has no activation.
 
     With absolute messages every convolution and every fully connected layer has a bias, as published. With differences
     only one of two that are added has.
 
     Args:
-        channels: Features of a fluid particle, of a wall point and of each layer; `own` counts the last inputs.
+        channels: Numbers of features of a fluid particle, a wall point and each layer; `own` counts the last inputs.
         kernel_size: Cells of the filter grid along each axis, (depth, height, width), in 2D (height, width).
         activation: "relu", "gelu", "tanh" or "leaky_relu".
         message: "absolute" or "difference", of all fluid convolutions.
@@ -124,7 +124,7 @@ class ConvNet(ConvolutionNetwork[ConvGeometry, ContinuousConv]):
         return self.dense[0] if self.own_channels else None
 
     def own(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C_own"]:
-        """What that layer takes of features (N, C_in)."""
+        """Select the inputs of that layer from features (N, C_in)."""
         return features[:, features.shape[1] - self.own_channels :]
 
     def forward(
@@ -148,7 +148,7 @@ class ConvNet(ConvolutionNetwork[ConvGeometry, ContinuousConv]):
         return output + (previous if self.skip == "before_activation" else activated)
 
     def linear_terms(self) -> "GridTerms":
-        """The network of a single layer as a linear map of its coefficients."""
+        """Return the network of a single layer as a linear function of its coefficients."""
         check_single_layer(len(self.convs))
         return GridTerms(self)
 
@@ -165,7 +165,7 @@ def _linear(inputs: int, outputs: int, bias: bool, initialization: str, generato
 
 
 class GridTerms(LinearTerms[ConvGeometry]):
-    """The single layer of a `ConvNet` as a linear map of its coefficients."""
+    """The single layer of a `ConvNet` as a linear function of its coefficients."""
 
     def __init__(self, network: ConvNet):
         self.network = network
@@ -199,7 +199,7 @@ class GridTerms(LinearTerms[ConvGeometry]):
 
     @property
     def _bias(self) -> Tensor | None:
-        """The bias that is fitted; convolutions with another of their own keep 0."""
+        """Return the bias that is fitted; other biases of convolutions stay 0."""
         dense = self.network.own_dense
         return None if dense is None else dense.bias
 

@@ -1,8 +1,8 @@
-"""What a prediction costs, known from a network's settings before anything is built: operations and memory traffic.
+"""The counted cost of a prediction, operations and memory traffic, from the settings of a network before it is built.
 
-Both are counted along the paths that `cconv.ops` takes on the CPU where nothing is differentiated. A count takes some
-ten microseconds, for searches that ask for thousands. Here are the parts that networks have in common; what a network
-is made of stands beside the network.
+Both are counted for the paths that `cconv.ops` takes on the CPU without derivatives. A count takes some ten
+microseconds, because a search needs thousands. This module has the parts that networks share; each network counts its
+own layers.
 """
 
 import math
@@ -13,17 +13,17 @@ from cconv.nn.kinds import Kinds
 from cconv.ops.general import multiplies_first
 
 FLOAT, INDEX = 4, 8  # bytes
-ARRAY = 2 * FLOAT  # bytes that move where an array operation writes a value and the next one reads it
+ARRAY = 2 * FLOAT  # bytes moved if an array operation writes a value and the next one reads it
 
 
 @dataclass(frozen=True, kw_only=True)
 class NeighborDensity:
-    """How many points a fluid particle of a scene has around it, on average.
+    """Mean density of points around a fluid particle of a scene.
 
     Attributes:
-        fluid: Neighbours a unit of volume within reach, lengths in particle spacings; about 1 inside a fluid.
-        walls: Boundary points, likewise.
-        wall_points: Boundary points of the scene over its fluid particles.
+        fluid: Neighbours per unit of volume, lengths in particle spacings; about 1 inside a fluid.
+        walls: Boundary points per unit of volume, likewise.
+        wall_points: Boundary points of the scene ÷ its fluid particles.
     """
 
     fluid: float
@@ -56,7 +56,7 @@ def ball_volume(radius: float, dim: int) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class CountedCost:
-    """Cost of one particle's prediction.
+    """Cost of a prediction per particle.
 
     Attributes:
         flops_per_particle: Multiplications and additions of the network.
@@ -99,10 +99,10 @@ class CountedConv:
 def count_filters(
     inputs: int, outputs: int, cells: int, corners: int, senders: float, neighbors: float, pair_bytes: int
 ) -> CountedCost:
-    """Cost of a convolution of scalars as `cconv.ops.convolution.convolve` computes it.
+    """Count a convolution of scalars as `cconv.ops.convolution.convolve` computes it.
 
-    Messages of a pair are added to the cells that it reads, or it reads products of the sender and all filters;
-    `pair_bytes` say where a pair reads the filters.
+    Either the message of a pair is added to the filter cells that it reads, or the pair reads the products of the
+    sender with all filters. `pair_bytes` is the memory that tells where a pair reads the filters.
     """
     products_first = multiplies_first(senders, 1.0, inputs, outputs)
     read = neighbors * corners * (outputs if products_first else inputs)

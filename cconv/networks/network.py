@@ -1,4 +1,4 @@
-"""What every network has: settings that build it, its geometry, its counted cost, and, if linear, its terms."""
+"""The base classes of networks: settings that build them, geometry, counted cost, and linear terms."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,14 +35,14 @@ Width = TypeVar("Width", int, Kinds)
 
 @dataclass(frozen=True)
 class Channels(Generic[Width]):
-    """How wide a network is: numbers of features, or of scalars and vectors.
+    """The widths of a network: numbers of features, or of scalars and vectors.
 
     Attributes:
-        inputs: What a fluid particle carries.
-        layers: Outputs of each layer, those of the last one the network's.
-        walls: What a wall point carries; None builds no branch for walls.
-        own: How many of the inputs, the last scalars and the first vectors, the first layer's linear map takes; None
-            for all. Without any there is no such map.
+        inputs: Input features of a fluid particle.
+        layers: Outputs of each layer; the last are the outputs of the network.
+        walls: Input features of a wall point; None builds no convolution of the walls.
+        own: Number of inputs (the last scalars and the first vectors) of the first layer's linear map of a particle's
+            own features; None for all. With 0 there is no such map.
 
     Raises:
         ConfigError: If there is no layer.
@@ -65,7 +65,7 @@ class Channels(Generic[Width]):
 
 @dataclass(frozen=True)
 class WallInputs(Generic[GeometryT]):
-    """What a network sees of the walls.
+    """Inputs of a network from the walls.
 
     Attributes:
         features: Features of the wall points (B, C).
@@ -77,7 +77,7 @@ class WallInputs(Generic[GeometryT]):
 
 
 class Layers(nn.ModuleList, Generic[Layer]):
-    """A list of layers of one type, which torch's list of modules would forget."""
+    """A list of layers of one type, which keeps the type that `torch.nn.ModuleList` forgets."""
 
     def __init__(self, layers: Iterable[Layer]):
         super().__init__(layers)
@@ -96,7 +96,7 @@ class Layers(nn.ModuleList, Generic[Layer]):
 
 
 class LinearTerms(ABC, Generic[GeometryT]):
-    """A network of a single layer as a linear map of its coefficients, for least squares."""
+    """A network of a single layer as a linear function of its coefficients, for least squares."""
 
     @abstractmethod
     def terms(
@@ -121,7 +121,7 @@ def assign_rows(weights: Sequence[Tensor], values: Float[Tensor, "P C"]) -> None
 
 
 class Network(nn.Module, ABC, Generic[GeometryT]):
-    """Maps features of fluid particles, and of walls, to outputs at the fluid particles."""
+    """A map from features of fluid particles and walls to outputs at the fluid particles."""
 
     @abstractmethod
     def forward(
@@ -132,38 +132,38 @@ class Network(nn.Module, ABC, Generic[GeometryT]):
         Args:
             features: Features of fluid particles, as `NetworkSettings.arrange` gives them.
             geometry: Fluid particles seen from fluid particles.
-            walls: Wall points, only with a branch for walls.
+            walls: Wall points, only if the network has a convolution of the walls.
 
         Returns:
             Scalars and vectors of the last layer, (N, S + V · D).
 
         Raises:
-            ShapeError: If inputs of walls are missing, or come without a branch for them.
+            ShapeError: If wall inputs are missing, or given to a network without a convolution of the walls.
         """
 
     @abstractmethod
     def linear_terms(self) -> LinearTerms[GeometryT]:
-        """The network as a linear map of its coefficients.
+        """Return the network as a linear function of its coefficients.
 
         Raises:
             ConfigError: If it has several layers.
         """
 
 
-def with_inputs(branch: Layer | None, walls: WallInputs[GeometryT] | None) -> list[tuple[Layer, WallInputs[GeometryT]]]:
-    """Pair a network's branch for walls, if it has one, with what it sees of them.
+def with_inputs(conv: Layer | None, walls: WallInputs[GeometryT] | None) -> list[tuple[Layer, WallInputs[GeometryT]]]:
+    """Pair the convolution of the walls, if the network has one, with its inputs.
 
     Raises:
-        ShapeError: If there are inputs without a branch, or a branch without inputs.
+        ShapeError: If only one of the two is given.
     """
-    if branch is None and walls is None:
+    if conv is None and walls is None:
         return []
-    if branch is None or walls is None:
+    if conv is None or walls is None:
         raise ShapeError(
-            "`walls` must be given exactly when the network has a boundary branch; it has "
-            f"{'none' if branch is None else 'one'}."
+            "`walls` must be given exactly when the network has a convolution of the walls; it has "
+            f"{'none' if conv is None else 'one'}."
         )
-    return [(branch, walls)]
+    return [(conv, walls)]
 
 
 class ConvolutionNetwork(Network[GeometryT], Generic[GeometryT, Layer]):
@@ -189,7 +189,7 @@ def check_single_layer(layers: int) -> None:
 class NetworkSettings(StrictModel, ABC):
     """Hyperparameters of a network of some architecture, as study files and checkpoints hold them.
 
-    `relative_cutoff` is the largest distance of two particles that see each other, in particle spacings.
+    `relative_cutoff` is the largest distance of neighbours, in particle spacings.
     """
 
     is_equivariant: ClassVar[bool] = False  # to rotations and reflections, whatever its weights
@@ -207,9 +207,9 @@ class NetworkSettings(StrictModel, ABC):
         """The network with fresh weights.
 
         Args:
-            inputs: What a fluid particle carries; the first scalar is a constant.
-            walls: What a wall point carries; None builds no branch for walls.
-            outputs: What the network predicts.
+            inputs: Input features of a fluid particle; the first scalar is a constant.
+            walls: Input features of a wall point; None builds no convolution of the walls.
+            outputs: Predicted scalars and vectors.
             dim: Number of space dimensions D.
             generator: Source of the initial weights; None for torch's global one.
         """
@@ -220,21 +220,21 @@ class NetworkSettings(StrictModel, ABC):
 
     @abstractmethod
     def geometry(self, edges: Edges) -> Geometry:
-        """What the network reads of pairs of particles, computed once for all layers."""
+        """Compute the geometry of pairs of particles, once for all layers."""
 
     @abstractmethod
     def has_intercept(self, outputs: Kinds) -> bool:
-        """Whether some of the output does not follow from the features, so that the target's mean may be taken off."""
+        """Tell whether the output has a constant part, so that the target's mean may be subtracted."""
 
     @abstractmethod
     def count(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity
     ) -> CountedCost:
-        """Cost of one particle's prediction, its features given; arguments as of `build`, and points around it."""
+        """Count the cost of a prediction per particle from its features; arguments as of `build`, and point density."""
 
 
 class ConvolutionSettings(NetworkSettings):
-    """What networks of stacked convolutions have in common.
+    """The common settings of networks of stacked convolutions.
 
     The layers have `first_channels`, then `hidden_channels`, and the components of the target.
     """
@@ -298,14 +298,14 @@ class ConvolutionSettings(NetworkSettings):
         """How many arrays of all pairs the geometry takes, for these convolutions."""
 
     def sent(self, inputs: Kinds) -> Kinds:
-        """What particles send to each other: without the constant where they send differences."""
+        """Return the features that particles send to each other; the constant is left out if they send differences."""
         return Kinds(inputs.scalars - self.takes_differences, inputs.vectors)
 
     def own(self, inputs: Kinds, outputs: Kinds) -> Kinds:
-        """What the first layer takes of a particle itself beside its convolution, a constant apart.
+        """Return the inputs of the first layer's linear map of a particle's own features, the constant left out.
 
-        A scalar from differences does not depend on it; of a vector, scalars of the particle may be factors, as the
-        density is of a density gradient.
+        A scalar from differences does not depend on them. A vector may have scalars of the particle as factors, as the
+        density is a factor of a density gradient.
         """
         if not self.takes_differences:
             return Kinds(inputs.scalars - 1, inputs.vectors)

@@ -80,9 +80,9 @@ class VectorLinear(nn.Module):
 class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
     """Network of scalars and vectors.
 
-    Every layer adds a radial convolution and a linear map of its input, the first one a convolution of the boundary
-    too. Where the widths of two layers agree, the output of the one before is added as well. Between layers the scalars
-    pass the activation, and each vector is multiplied with the sigmoid of a scalar that its layer computes for it.
+    Every layer adds a radial convolution and a linear map of its input; the first layer also adds a convolution of
+    the walls. If two layers have the same width, the output of the earlier one is added as well. Between layers the
+    scalars pass the activation, and each vector is multiplied with the sigmoid of a scalar that its layer computes.
 
     Args:
         channels: Scalars and vectors of a fluid particle, of a wall point and of each layer.
@@ -133,7 +133,7 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         return self.dense[0] if any(self.own_channels) else None
 
     def own(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C_own"]:
-        """What that map takes of features (N, S + V · D)."""
+        """Select the inputs of that map from features (N, S + V · D)."""
         own = self.own_channels
         scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
         return join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
@@ -178,8 +178,8 @@ class RadialTerms(LinearTerms[RadialGeometry]):
         self, features: Float[Tensor, "N C"], geometry: RadialGeometry, walls: WallInputs[RadialGeometry] | None = None
     ) -> list[Float[Tensor, "R P"]]:
         """Terms of the scalars (N, P) and of the components of the vectors (N · D, P'), where there are any."""
-        branches = with_inputs(self.network.boundary_conv, walls)
-        gathered = [_radial_columns(conv, seen.features, seen.geometry) for conv, seen in branches]
+        boundary = with_inputs(self.network.boundary_conv, walls)
+        gathered = [_radial_columns(conv, seen.features, seen.geometry) for conv, seen in boundary]
         gathered.append(_radial_columns(self.network.convs[0], features, geometry))
         scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
         of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
@@ -221,7 +221,7 @@ def _radial_columns(conv: RadialConv, features: Tensor, geometry: RadialGeometry
 
 
 class RadialNetSettings(ConvolutionSettings):
-    """Hyperparameters of a `RadialNet`, each of whose hidden layers has so many scalars and as many vectors."""
+    """Hyperparameters of a `RadialNet`; the channels of a hidden layer are its number of scalars and of vectors."""
 
     is_equivariant = True
     basis_size = "radial_terms"

@@ -1,4 +1,4 @@
-"""Continuous convolution on the CPU, block by block: nothing of size N·K^D·C is ever kept.
+"""Continuous convolution on the CPU, block by block, which never stores anything of size N·K^D·C.
 
 With the matrices S_k of the reads (row i, column j: weight with which the edge from j to i reads cell k), features F,
 filters W_k and the output Y:
@@ -6,8 +6,8 @@ filters W_k and the output Y:
     gather first      Y = sum_k (S_k F) W_k         columns S_k F of a block of receivers stay in a core's cache
     multiply first    Y = sum_k S_k (F W_k)         products F W_k are small where C_out is
 
-The derivatives are convolutions of the same kind along the edges turned round, with dY for features and the transposed
-filters. Gathering first along them gives columns T_k = S_kᵀ dY that serve both derivatives:
+The derivatives are convolutions of the same kind along the reversed edges (the transpose), with dY for features and the
+transposed filters. Gathering first along them gives columns T_k = S_kᵀ dY that serve both derivatives:
 
     dF = sum_k T_k W_kᵀ,   dW_k = Fᵀ T_k
 
@@ -26,8 +26,8 @@ from cconv.ops.filter_reads import FilterReads
 from cconv.ops.products import linear
 from cconv.ops.workers import run_on_workers
 
-_BLOCK_BYTES = 3 * 2**19  # of columns that a thread works on: about a core's cache
-_PRODUCT_BYTES = 2**25  # of products between multiplying and reading
+_BLOCK_BYTES = 3 * 2**19  # size of the columns that a thread works on: about a core's cache
+_PRODUCT_BYTES = 2**25  # size of the products between multiplication and reading
 _VALUES_PER_WORKER = 2**19  # set or read: fewer cost less than waking a thread
 
 Rows = tuple[np.ndarray, np.ndarray | None, np.ndarray]  # splits, order of the edges, neighbour of each edge
@@ -133,7 +133,7 @@ def _both_derivatives(
     weights = filters.permute(1, 0, 2).reshape(in_channels, num_cells * out_channels)
     derivative = torch.empty_like(features)
     sums = _Sums(features, (in_channels, num_cells * out_channels))
-    gather = _gather_turned(gradient, reads, own)
+    gather = _gather_transposed(gradient, reads, own)
 
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
         gather(first, last, columns)
@@ -150,7 +150,7 @@ def _both_derivatives(
 def _read_products(
     values: Tensor, filters: Tensor, reads: FilterReads, rows: list[tuple[float, Rows]], num_rows: int
 ) -> Tensor:
-    """Sum of what each row's edges read of ``values @ filters``; `rows` lists edges, with a factor each."""
+    """Sum for each row what its edges read from ``values @ filters``; `rows` lists the edges, with a factor each."""
     num_cells, in_channels, out_channels = filters.shape
     weights = filters.permute(0, 2, 1).reshape(num_cells * out_channels, in_channels)
     output = values.new_zeros(num_rows, out_channels)
@@ -169,7 +169,7 @@ def _read_products(
 
 
 class _Sums:
-    """A sum that each worker adds to in a tensor of its own."""
+    """A sum to which each worker adds in a tensor of its own."""
 
     def __init__(self, like: Tensor, shape: tuple[int, int]):
         self._parts = [like.new_zeros(shape) for _ in range(torch.get_num_threads())]
@@ -232,7 +232,7 @@ def _edges(reads: FilterReads) -> tuple[np.ndarray, ...]:
 
 
 def _gather(features: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:
-    """Sets the columns S_k F of a block, for messages with ``own`` times the receiver's features."""
+    """Compute the columns S_k F of a block, for messages with ``own`` times the receiver's features."""
     values = features.numpy()
     arrays = (*_by_receiver(reads), *_edges(reads), values)
     if own:
@@ -241,8 +241,8 @@ def _gather(features: Tensor, reads: FilterReads, own: float) -> Callable[[int, 
     return lambda first, last, columns: gathers.gather(first, last, *arrays, columns.numpy())
 
 
-def _gather_turned(gradient: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:
-    """Sets the columns T_k = S_kᵀ dY of a block."""
+def _gather_transposed(gradient: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:
+    """Compute the transposed columns T_k = S_kᵀ dY of a block."""
     values, edges = gradient.numpy(), _edges(reads)
     arrays = (*_by_sender(reads), *edges, values)
     own_arrays = (reads.row_splits.numpy(), *edges, values, values.dtype.type(own))

@@ -1,4 +1,4 @@
-"""Which way a continuous convolution is computed."""
+"""The choice between the fast and the general path of a continuous convolution."""
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float =
 
 
 def columns(features: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
-    """Messages gathered into the filter cells of each receiver, (N, K^D · C_in), not differentiable.
+    """Gather the messages into the filter cells of each receiver, (N, K^D · C_in), not differentiable.
 
     With filters flattened to (K^D · C_in, C_out), ``columns(...) @ filters`` is the convolution. Arguments as above.
     """

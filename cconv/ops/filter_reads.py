@@ -1,4 +1,4 @@
-"""Where each edge of a graph reads a grid of filters, and with which weights."""
+"""Interpolation stencils: the cells of the filter grid that each edge reads, and their weights."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ class FilterReads:
         receivers: Receiver i of each edge, (E,), int64, ascending.
         senders: Sender j of each edge, (E,), int64.
         cells: Lowest cell that each edge reads, (E,), int32.
-        fractions: Place between the cells, (E, A), in [0, 1].
+        fractions: Position between the cells, (E, A), in [0, 1].
         weights: Window, border and 1/ψ of each edge, (E,).
         corner_offsets: (2^A,), int32.
         num_cells: Cells of the grid, K^D.
-        num_senders: Number of points that could send, M.
+        num_senders: Number of points that can be senders, M.
     """
 
     row_splits: Tensor

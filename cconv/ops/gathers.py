@@ -36,7 +36,7 @@ def _corner_weight(weight, fractions, corner, first_axis):
 
 
 @njit(inline="always")
-def _spread(message, edge, cells, fractions, weights, corner_offsets, here):
+def _scatter_add(message, edge, cells, fractions, weights, corner_offsets, here):
     """Add the message of an edge to the cells that it reads."""
     # Two rows of cells at a time: few loads and stores, whatever the number of axes.
     for corner in range(0, len(corner_offsets), 2):
@@ -52,7 +52,7 @@ def _spread(message, edge, cells, fractions, weights, corner_offsets, here):
 
 
 @njit(inline="always")
-def _put(message, edge, cells, weights, here):
+def _add_to_cell(message, edge, cells, weights, here):
     """Add the message of an edge to the one cell that it reads."""
     cell, weight = here[cells[edge]], weights[edge]
     for c in range(len(message)):
@@ -73,9 +73,9 @@ def gather(first, last, splits, order, neighbors, cells, fractions, weights, cor
             edge = place if order is None else order[place]
             there = values[neighbors[edge]]
             if interpolates:
-                _spread(there, edge, cells, fractions, weights, corner_offsets, here)
+                _scatter_add(there, edge, cells, fractions, weights, corner_offsets, here)
             else:
-                _put(there, edge, cells, weights, here)
+                _add_to_cell(there, edge, cells, weights, here)
 
 
 @_compile
@@ -94,9 +94,9 @@ def gather_with_own(
             for c in range(len(message)):
                 message[c] = there[c] + own * mine[c]
             if interpolates:
-                _spread(message, edge, cells, fractions, weights, corner_offsets, here)
+                _scatter_add(message, edge, cells, fractions, weights, corner_offsets, here)
             else:
-                _put(message, edge, cells, weights, here)
+                _add_to_cell(message, edge, cells, weights, here)
 
 
 @_compile
@@ -121,9 +121,9 @@ def read(
 ):
     """Add to the output of each row what its edges read from the products of their neighbours, times `own`.
 
-    `products` (P, K^D, C) are those of the neighbours from `start` on; others are left out.
+    `products` (P, K^D, C) are the products of the neighbours from `start` on; other neighbours are ignored.
     """
-    # Unsigned places in one row of values: indices that may count from the end cost half of the time.
+    # Unsigned indices in one row of values: signed ones, which may count from the end, cost half of the time.
     num_products, num_cells, channels = products.shape
     values, width = products.reshape(-1), uintp(channels)
     axes, corners = fractions.shape[1], len(corner_offsets)

@@ -9,12 +9,12 @@ from cconv.ops.filter_reads import FilterReads
 
 
 def multiplies_first(num_senders: float, num_receivers: float, in_channels: int, out_channels: int) -> bool:
-    """Whether products of the senders are so much narrower than columns of the receivers that they come first."""
+    """Tell whether to multiply by the filters before gathering: cheaper if C_out is much smaller than C_in."""
     return 4 * num_senders * out_channels <= num_receivers * in_channels
 
 
 def gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
-    """Messages gathered into the filter cells of each receiver, then one product with the filters.
+    """Gather the messages into the filter cells of each receiver, then multiply once by the filters.
 
     Args:
         features: (M, C_in).
@@ -29,7 +29,7 @@ def gather_then_multiply(features: Tensor, filters: Tensor, reads: FilterReads, 
 
 
 def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
-    """Messages gathered into the filter cells of each receiver, (N, K^D · C_in); arguments as above."""
+    """Gather the messages into the filter cells of each receiver, (N, K^D · C_in); arguments as above."""
     messages = features[reads.senders]
     if own:
         messages = messages + own * features[reads.receivers]
@@ -40,7 +40,7 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
 
 
 def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
-    """Features of each sender multiplied with the filter of every cell, then read by the edges; arguments as above."""
+    """Multiply the features of each sender by the filter of every cell, then let the edges read; arguments as above."""
     num_cells, _, out_channels = filters.shape
     products = (features @ filters.transpose(0, 1).flatten(1)).reshape(-1, out_channels)
     output = features.new_zeros(reads.num_receivers, out_channels)

@@ -1,7 +1,7 @@
-"""Radial convolution in compiled loops over a few hundred edges at a time: nothing of the size of all edges is made.
+"""Radial convolution in compiled loops over a few hundred edges at a time, without arrays as large as all edges.
 
-For the CPU, float32 and float64; not differentiable. Each edge reads the filters of all outputs, at a cost that grows
-with their number: for few of them. Compiled as in `gathers`, but that sums may also change their order.
+It runs on the CPU in float32 and float64 and is not differentiable. Each edge reads the filters of all outputs, so it
+is fast only for few outputs. Compiled as in `gathers`, but that sums may also change their order.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ from cconv.ops.workers import run_on_workers
 
 _compile = compile_cached(nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 
-EDGES_AT_A_TIME = 512  # worked on at a time: their values fit the innermost cache
-MOST_OUTPUTS = 20  # of a kind: more take longer than gathering messages and multiplying them with the filters
+EDGES_AT_A_TIME = 512  # number of edges at a time: their values fit the innermost cache
+MOST_OUTPUTS = 20  # largest number of outputs of a kind: for more, gathering messages and a matrix product are faster
 _READS_PER_WORKER = 2**19  # fewer cost less than waking a thread
 
 
 def applies(features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, edges: Edges) -> bool:
-    """Whether `convolve` does, and is faster than the general path: nothing to differentiate, few outputs, the CPU."""
+    """Tell whether `convolve` can be used and is fast: nothing to differentiate, few outputs, the CPU."""
     tensors = (features, scalar_filters, vector_filters, edges.displacements)
     differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     return (
@@ -64,7 +64,7 @@ def convolve(
 
 
 def _by_output(filters: Tensor) -> np.ndarray:
-    """Filters (B, C_in, C_out) as (C_out, C_in, B + 1), the last value twice: there is one above the last, too."""
+    """Reorder filters (B, C_in, C_out) to (C_out, C_in, B + 1); the last value is repeated for the interpolation."""
     values = filters.detach().numpy()
     return np.ascontiguousarray(np.concatenate([values, values[-1:]]).transpose(2, 1, 0))
 
@@ -102,7 +102,7 @@ def _convolve_rows(
 
 @_compile
 def _place(distances, cutoff, num_terms, lower, shares):
-    """Set the filter value at or below each distance, and the shares of it and of the next."""
+    """Set the index of the filter value at or below each distance, and the weights of it and the next."""
     one, steps = distances.dtype.type(1), distances.dtype.type(num_terms - 1)
     largest = int32(max(num_terms - 2, 0))
     for k in range(uintp(len(distances))):
@@ -157,7 +157,7 @@ def _project(directions, count, scalars, vectors, messages):
 
 @_compile
 def _add_read(values, lower, shares, message, count, sums):
-    """Add what each edge reads of a filter times its message."""
+    """Add the filter value of each edge times its message."""
     for k in range(count):
         place = uintp(lower[k])
         sums[k] += (shares[0, k] * values[place] + shares[1, k] * values[place + uintp(1)]) * message[k]

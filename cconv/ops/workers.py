@@ -20,8 +20,8 @@ def run_on_workers(work: Callable[[int], None], workers: int) -> None:
     """Call ``work(worker)`` for each worker from 0, each in a thread of its own; a single one runs in this thread.
 
     Args:
-        work: What to do, given the number of the worker.
-        workers: How many, at most `torch.get_num_threads()`.
+        work: Function of the number of the worker.
+        workers: Number of workers, at most `torch.get_num_threads()`.
     """
     if workers == 1:
         work(0)
@@ -40,7 +40,7 @@ def run_on_workers(work: Callable[[int], None], workers: int) -> None:
 
 
 def results_of(calls: Sequence[Callable[[], Any]]) -> list:
-    """Results of `calls`, which run side by side where torch has several threads; nothing in them is differentiated."""
+    """Return the results of `calls`, which run at the same time if torch has several threads; without derivatives."""
     if torch.get_num_threads() == 1:
         return [call() for call in calls]
     results = [None] * len(calls)
@@ -54,7 +54,7 @@ def results_of(calls: Sequence[Callable[[], Any]]) -> list:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Compute with so many threads of torch, then with as many as before."""
+    """Set the number of torch threads inside the block, and restore it afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -84,8 +84,8 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
 def _dismiss_torch_threads() -> None:
     """End the idle threads that torch keeps for this thread; its next parallel operation starts new ones.
 
-    After each operation they wait busily for up to several milliseconds, on the cores that the workers need: on two
-    cores a training step takes a third longer beside them.
+    After each operation they spin for up to several milliseconds on the cores that the workers need: on two cores a
+    training step takes a third longer beside them.
     """
     pause, device = _openmp_pause()
     if pause is not None:

@@ -1,4 +1,4 @@
-"""Scenes of fluid dynamics: particles, walls, forces, solver settings, and what a scene has."""
+"""Scenes of fluid dynamics: particles, walls, forces, solver settings and features."""
 
 import math
 from typing import Any
@@ -39,7 +39,7 @@ def scene_named(name: str, size: str = "published", **settings: Any) -> Simulate
         **settings: Settings to replace, such as `viscosity`; None keeps the size's own.
 
     Raises:
-        ConfigError: If there is no such scene or size, or a setting cannot be.
+        ConfigError: If there is no such scene or size, or a setting is impossible.
     """
     check_choice("scene", name, SCENES)
     scene = SCENES[name]

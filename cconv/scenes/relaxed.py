@@ -1,7 +1,7 @@
-"""Random states in which particles are evenly spread but stand on no lattice.
+"""Relaxed random states: particles are evenly spread, but not on a lattice.
 
-As LagrangeBench prepares its initial states: particles start near a lattice and are moved by the transport velocity
-until they have spread.
+Initial states are prepared as in LagrangeBench: particles start near a lattice and are moved by the transport velocity
+until they are evenly spread.
 """
 
 import torch
@@ -19,7 +19,7 @@ _VISCOSITY = 0.2  # in spacings times the speed of sound: motion dies out within
 def relaxed(
     positions: Tensor, *, box: Box, walls: Walls, spacing: float, generator: torch.Generator, steps: int
 ) -> Tensor:
-    """Positions (N, D), float64, shaken and spread evenly in a box that they fill.
+    """Move a lattice to random, evenly spread positions (N, D), float64, in a box that it fills.
 
     Args:
         positions: Lattice to start from (N, D).
@@ -56,9 +56,9 @@ def relaxed(
 
 
 def glass(lower: Tensor, upper: Tensor, spacing: float, generator: torch.Generator, steps: int) -> Tensor:
-    """Relaxed particles (N, D), float64, that fill a box and know nothing of its sides: bodies are cut out of them.
+    """Fill a box with relaxed particles (N, D), float64, not aligned to its sides, to cut bodies out of them.
 
-    Copies of one periodic cube, side by side from a random place on.
+    They are copies of one periodic cube, placed side by side from a random origin.
     """
     dim = len(lower)
     cells = {1: 64, 2: 32, 3: 12}[dim]

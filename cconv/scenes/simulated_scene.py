@@ -1,4 +1,4 @@
-"""What the scenes that the solver computes have in common: particles, walls, forces, settings, and what a scene has."""
+"""The base class of scenes that the solver computes: particles, walls, forces, settings and features."""
 
 import math
 from abc import ABC, abstractmethod
@@ -26,12 +26,12 @@ from cconv.sph.solver import (
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedScene(ABC):
-    """A scene at one size. Class attributes say what holds for every size.
+    """A scene at one size. Class attributes hold for every size.
 
     Attributes:
         particle_spacing: dx.
         viscosity: Kinematic viscosity ν.
-        time_step: Of the solver; infinity for the largest that the CFL conditions allow.
+        time_step: Time step of the solver; infinity for the largest that the CFL conditions allow.
         steps_per_frame: Steps between stored frames.
         num_frames: Stored frames of a trajectory, the start included.
         skipped_frames: Frames before the first that is stored, until the flow has developed.
@@ -39,13 +39,13 @@ class SimulatedScene(ABC):
         relaxation_steps: Steps that spread the particles at the start.
 
         name: Name of the scene.
-        case: What LagrangeBench calls it.
+        case: Name of the scene in LagrangeBench.
         dim: Number of space dimensions.
         source: Where the scene is defined.
         sizes: Settings of each size, "published" and "small".
         rest_density: ρ_0.
         reference_speed: Largest speed expected; the speed of sound is ten times as large.
-        background_pressure: In units of ρ_0 c²/γ.
+        background_pressure: Background pressure in units of ρ_0 c²/γ.
         density_scheme: "summation" or "evolution".
         artificial_viscosity: α as published, which belongs to a speed of sound of 10.
         gravity: Constant external acceleration, D numbers, or None.
@@ -53,7 +53,7 @@ class SimulatedScene(ABC):
         varying_viscosity: Whether trajectories differ in viscosity.
 
     Raises:
-        ConfigError: If a setting cannot be, or the time step breaks a CFL condition.
+        ConfigError: If a setting is impossible, or the time step violates a CFL condition.
     """
 
     particle_spacing: float
@@ -131,7 +131,7 @@ class SimulatedScene(ABC):
 
     @property
     def features(self) -> dict[str, bool]:
-        """What the scene has, and hence what a model of it may need."""
+        """Features of the scene, which a model of it may need."""
         walls = self.walls
         return {
             "walls": len(walls) > 0,

@@ -1,6 +1,6 @@
-"""Water at rest under gravity in an open box, 2D: what a solver or network must leave as it is.
+"""Water at rest under gravity in an open box, 2D, which a solver or network must leave at rest.
 
-Source: hydrostatics; pressure ρ_0 g (H - y). Adami, Hu, Adams, J. Comput. Phys. 231 (2012), have the test.
+Source: hydrostatics; pressure ρ_0 g (H - y). The test is from Adami, Hu, Adams, J. Comput. Phys. 231 (2012).
 """
 
 import math

@@ -128,7 +128,7 @@ def test_a_checkpoint_of_the_version_before_is_refused_with_the_way_out(architec
         ({"features": ["one"]}, "the feature 'velocity' must be one of `features`"),
         ({"features": ["one", "one", "velocity"]}, "must hold each name once"),
         ({"features": ["one", "velocity", "colour"]}, "no feature 'colour'"),
-        ({"wall_vectors": 1, "features": ["one", "velocity"]}, "a branch for walls needs the feature 'walls'"),
+        ({"wall_vectors": 1, "features": ["one", "velocity"]}, "a convolution of the walls needs the feature 'walls'"),
         ({"wall_vectors": 1, "wall_scalars": 1}, "a scalar or a vector, not both"),
         ({"task": "x" * 10**6}, "`task` must be one of density_rate, density_gradient"),
         ({"network": {"architecture": "x" * 10**6}}, "expected tags: 'conv_net', 'radial_net'"),

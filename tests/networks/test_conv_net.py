@@ -50,19 +50,19 @@ def test_a_single_layer_adds_its_branches(scene, generator):
     torch.testing.assert_close(net(*scene), expected)
 
 
-def test_a_scene_without_boundary_builds_no_boundary_branch(scene):
+def test_a_scene_without_boundary_builds_no_convolution_of_the_walls(scene):
     features, geometry, _ = scene
     net = ConvNet(Channels(4, (5, 6, 1)), CELLS)
     assert net.boundary_conv is None
     assert not any("boundary" in name for name, _ in net.named_parameters())
     assert net(features, geometry).shape == (25, 1)
-    with pytest.raises(ShapeError, match="boundary"):
+    with pytest.raises(ShapeError, match="convolution of the walls"):
         net(*scene)
 
 
-def test_boundary_branch_needs_boundary_inputs(scene):
+def test_a_convolution_of_the_walls_needs_their_inputs(scene):
     features, geometry, _ = scene
-    with pytest.raises(ShapeError, match="boundary"):
+    with pytest.raises(ShapeError, match="convolution of the walls"):
         ConvNet(FULL, CELLS)(features, geometry)
 
 

@@ -15,9 +15,10 @@ CHANNELS = [((2, 1), (1, 0)), ((2, 1), (0, 1)), ((0, 3), (3, 2)), ((3, 0), (2, 2
 
 def case(generator, channels, dim=3, *, terms=6, message="absolute", window="none", points=60, dtype=torch.float64):
     positions = torch.rand(points, dim, generator=generator, dtype=dtype)
-    layer = RadialConv(*channels, terms, dim, bias=False, message=message, generator=generator).to(dtype)
+    inputs, outputs = (Kinds(*kinds) for kinds in channels)
+    layer = RadialConv(inputs, outputs, terms, dim, bias=False, message=message, generator=generator).to(dtype)
     geometry = RadialGeometry(radius_graph(positions, 0.45), terms, window=window, normalize=window != "none")
-    features = torch.randn(points, Kinds(*channels[0]).num_values(dim), generator=generator, dtype=dtype)
+    features = torch.randn(points, inputs.num_values(dim), generator=generator, dtype=dtype)
     return layer, features, geometry
 
 
