@@ -137,6 +137,8 @@ def _sentence(problem: Mapping) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "union_tag_invalid":  # the tag stands in the message, whole
         message = message.replace(f"'{problem['ctx']['tag']}'", shown(problem["ctx"]["tag"]))
+    if problem["type"] == "union_tag_not_found":
+        message = f"{problem['ctx']['discriminator']} is missing; see the documentation for what it may be"
     came = "" if isinstance(problem["input"], Mapping) else f", got {shown(problem['input'])}"
     return f"{message[0].lower()}{message[1:]}{came}."
 

@@ -322,7 +322,7 @@ def _ablation() -> Ablation:
         of="best",
         error=0.001,
         path=[_step("baseline", 0.016), _step("lost", None), _step("network.layers", 0.002)],
-        branches=[_toggled("walls", True, 0.00421), _toggled("density", False, None)],
+        toggled=[_toggled("walls", True, 0.00421), _toggled("density", False, None)],
     )
 
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from cconv.domain import Box
+from cconv.errors import ShapeError
 
 
 def squared_errors(positions: Tensor, reference: Tensor, box: Box) -> Tensor:
@@ -20,7 +21,13 @@ def squared_errors(positions: Tensor, reference: Tensor, box: Box) -> Tensor:
 
 
 def mse_n(errors: Tensor, n: int) -> float:
-    """MSE_n of LagrangeBench: the mean over the first `n` frames of the errors (T,) of `squared_errors`."""
+    """MSE_n of LagrangeBench: the mean over the first `n` frames of the errors (T,) of `squared_errors`.
+
+    Raises:
+        ShapeError: If the rollout has fewer frames.
+    """
+    if len(errors) < n:
+        raise ShapeError(f"MSE_{n} needs {n} frames of a rollout, got {len(errors)}.")
     return float(errors[:n].mean())
 
 

@@ -1,6 +1,6 @@
 """Charts of a study. Each function returns a matplotlib figure of its own; showing or saving it is the caller's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import pandas as pd
@@ -47,22 +47,22 @@ def learning_curves_chart(curves: pd.DataFrame, summary: Summary | None = None) 
     return figure
 
 
-def budget_chart(curves: pd.DataFrame, summary: Summary) -> Figure:
-    """Validation error of every training of the finalists against gradient updates, and against training seconds.
+def budget_chart(curves: pd.DataFrame, models: Sequence[str], error: str) -> Figure:
+    """Validation error of every training of some models against gradient updates, and against training seconds.
 
     Args:
         curves: Evaluations as `curves_table` gives them.
-        summary: Names the finalists, each of which has a colour.
+        models: Their ids, each of which has a colour.
+        error: What the error is called.
     """
     figure, panels = new_panels(12, 4.4, columns=2)
-    finalists = [entry.id for entry in summary.finalists]
-    is_shown = curves["retrained"] & curves["name"].isin(finalists) & curves["valid_error"].notna()
+    is_shown = curves["retrained"] & curves["name"].isin(models) & curves["valid_error"].notna()
     shown = curves[is_shown]
-    colors = dict(zip(finalists, sns.color_palette("husl", len(finalists)), strict=True))
+    colors = dict(zip(models, sns.color_palette("husl", len(models)), strict=True))
     for axes, x, label in zip(panels, ("updates", "seconds"), ("gradient updates", "training time [s]"), strict=True):
         for name, lines in shown.groupby("name", sort=False):
             _draw_seeds(axes, lines, x, name, colors[name])
-        axes.set(yscale="log", xlabel=label, ylabel=_error_label(summary))
+        axes.set(yscale="log", xlabel=label, ylabel=f"validation error ({error})")
     trained = shown["updates"][shown["updates"] > 0]
     panels[0].set_xscale("symlog", linthresh=trained.min() if len(trained) else 1)  # least squares takes no update
     panels[0].set(title="error against updates, one line a seed", xlim=(0, None))

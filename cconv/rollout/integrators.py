@@ -6,6 +6,7 @@ from torch import Tensor
 
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
+from cconv.errors import ShapeError
 from cconv.rollout.prescribed import carried_on
 
 
@@ -13,7 +14,7 @@ class Integrator(Protocol):
     """Leads from a window to the next frame.
 
     One law holds for all: ``advance(window, target(window, scene), scene)`` has the stored next frame as its present,
-    so that a rollout of targets has no error.
+    so that a rollout of targets has no error. What is no fluid must rest or move at a constant velocity for it.
     """
 
     def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
@@ -41,7 +42,7 @@ class SemiImplicitEuler:
 
     def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
         """The window a frame later; arguments as of `Integrator.advance`."""
-        now, fluid = window.positions[-2:].double(), window.is_fluid
+        now, fluid = _last_two(window), window.is_fluid
         velocities = scene.box.displacement(now[1, fluid], now[0, fluid]) + prediction.double()
         following = carried_on(window, scene)
         following[fluid] = scene.box.wrap(now[1, fluid] + velocities)
@@ -50,5 +51,16 @@ class SemiImplicitEuler:
     def target(self, window: Window, scene: Scene) -> Tensor:
         """Second difference (M, D) of the positions of the fluid at the present frame, float64."""
         fluid, following = window.is_fluid, window.future[0].double()
-        before, now = window.positions[-2:, fluid].double()
+        before, now = _last_two(window)[:, fluid]
         return scene.box.displacement(following[fluid], now) - scene.box.displacement(now, before)
+
+
+def _last_two(window: Window) -> Tensor:
+    """The last two frames (2, N, D), float64.
+
+    Raises:
+        ShapeError: If there are fewer, which say nothing of velocities.
+    """
+    if len(window.positions) < 2:
+        raise ShapeError(f"a window must have at least 2 frames up to the present, got {len(window.positions)}.")
+    return window.positions[-2:].double()

@@ -220,9 +220,10 @@ def training_steps(folder: Path) -> dict[str, Callable[[], None]]:
 
     steps = {"ours": partial(step, model, adam(model), lambda: model(inputs, model.geometry(inputs)))}
     if HAS_OPEN3D:
-        theirs = Open3DNet(inputs.features.shape[1], inputs.boundary_features.shape[1], target.shape[1])
-        features = (inputs.features - model.feature_mean) / model.feature_scale
-        tensors = (features, inputs.positions, inputs.boundary_features, inputs.boundary_positions)
+        fluid, walls = inputs.features.flat(), inputs.wall_features.flat()
+        theirs = Open3DNet(fluid.shape[1], walls.shape[1], target.shape[1])
+        features = (fluid - model.feature_mean) / model.feature_scale
+        tensors = (features, inputs.positions, walls, inputs.wall_positions)
         steps["Open3D"] = partial(
             step, theirs, adam(theirs), lambda: theirs(*tensors, 2 * model.config.network.relative_cutoff)
         )

@@ -18,6 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from rich.progress import track
 
+from cconv.evaluation.objectives import NormalizedMSE
 from cconv.files import write_json
 from cconv.models.checkpoint import load_model
 from cconv.report.plots import budget_chart
@@ -86,7 +87,7 @@ def chart(results: list[Mapping]) -> Figure:
     """Validation error against updates and against training seconds, a line for each training."""
     facts = [{"name": each["model"], "seed": each["seed"], "retrained": True, "log": each["log"]} for each in results]
     curves = pd.DataFrame([{**fact, **entry} for fact in facts for entry in fact["log"]])
-    return budget_chart(curves, list(dict.fromkeys(each["model"] for each in results)))
+    return budget_chart(curves, list(dict.fromkeys(each["model"] for each in results)), NormalizedMSE.label)
 
 
 def main() -> None:

@@ -39,31 +39,46 @@ from cconv.tasks.samples import Sample, make_sample
 
 SPACING = 0.05
 DIM = 3
-LAYERS = {"architecture": "radial_net"}
-LAYER = LAYERS | {"layers": 1, "message": "difference", "relative_cutoff": 2.0, "window": "none"}
+LAYERS = {"network.architecture": "radial_net"}
+LAYER = LAYERS | {
+    "network.layers": 1,
+    "network.message": "difference",
+    "network.relative_cutoff": 2.0,
+    "network.window": "none",
+}
 COMPARED = {
     "published network": {},
     "radial layer": LAYER,
-    "radial layer, no walls": LAYER | {"walls": False, "density": False},
+    "radial layer, no walls": LAYER | {"task.features.walls": False, "task.features.density": False},
 }
 CHECKED = COMPARED | {
-    "grid layer": {"layers": 1},
-    "grid layer, identity": {"layers": 1, "mapping": "identity", "window": "none"},
-    "grid layer, K = 6, no walls": {"layers": 1, "kernel_size": 6, "walls": False},
-    "2 grid layers of 8": {"layers": 2, "first_channels": 8},
-    "2 grid layers, nearest cell": {"layers": 2, "first_channels": 16, "interpolation": "nearest_neighbor"},
-    "3 grid layers of 16": {"layers": 3, "first_channels": 16, "hidden_channels": 16},
-    "3 grid layers, R = 1.5, no walls": {"layers": 3, "mapping": "identity", "relative_cutoff": 1.5, "walls": False},
-    "4 grid layers, K = 3": {"kernel_size": 3, "first_channels": 16, "hidden_channels": 32},
-    "radial layer, poly6, R = 2.5": LAYER | {"window": "poly6", "relative_cutoff": 2.5, "walls": False},
-    "2 radial layers of 8": LAYERS | {"layers": 2, "first_channels": 8},
-    "2 radial layers of 32, no walls": {
-        "layers": 2,
-        "architecture": "radial_net",
-        "first_channels": 32,
-        "walls": False,
+    "grid layer": {"network.layers": 1},
+    "grid layer, identity": {"network.layers": 1, "network.mapping": "identity", "network.window": "none"},
+    "grid layer, K = 6, no walls": {"network.layers": 1, "network.kernel_size": 6, "task.features.walls": False},
+    "2 grid layers of 8": {"network.layers": 2, "network.first_channels": 8},
+    "2 grid layers, nearest cell": {
+        "network.layers": 2,
+        "network.first_channels": 16,
+        "network.interpolation": "nearest_neighbor",
     },
-    "3 radial layers of 8": LAYERS | {"layers": 3, "first_channels": 8, "hidden_channels": 8},
+    "3 grid layers of 16": {"network.layers": 3, "network.first_channels": 16, "network.hidden_channels": 16},
+    "3 grid layers, R = 1.5, no walls": {
+        "network.layers": 3,
+        "network.mapping": "identity",
+        "network.relative_cutoff": 1.5,
+        "task.features.walls": False,
+    },
+    "4 grid layers, K = 3": {"network.kernel_size": 3, "network.first_channels": 16, "network.hidden_channels": 32},
+    "radial layer, poly6, R = 2.5": LAYER
+    | {"network.window": "poly6", "network.relative_cutoff": 2.5, "task.features.walls": False},
+    "2 radial layers of 8": LAYERS | {"network.layers": 2, "network.first_channels": 8},
+    "2 radial layers of 32, no walls": {
+        "network.layers": 2,
+        "network.architecture": "radial_net",
+        "network.first_channels": 32,
+        "task.features.walls": False,
+    },
+    "3 radial layers of 8": LAYERS | {"network.layers": 3, "network.first_channels": 8, "network.hidden_channels": 8},
 }
 SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000, 50_000) for periodic in (False, True)]
 SEARCHES += [(3, 100_000, False), (3, 100_000, True)]

@@ -87,7 +87,7 @@ def test_a_radial_model_turns_with_the_scene(task, message, generator):
 
 
 def test_settings_of_another_architecture_are_refused():
-    with pytest.raises(ConfigError, match="not possible .skip: Input should be 'before_activation' or 'none'"):
+    with pytest.raises(ConfigError, match="not possible .network.skip: Input should be 'before_activation' or 'none'"):
         configured(architecture="radial_net", skip="after_activation")
 
 

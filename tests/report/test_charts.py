@@ -157,7 +157,9 @@ def test_charts_of_the_search_show_the_trials(run):
 
 def test_the_chart_of_budgets_has_a_line_for_each_seed_of_each_finalist(run, summary):
     ids = [entry.id for entry in summary.finalists]
-    updates, seconds = budget_chart(curves_table(run), summary).axes
+    updates, seconds = budget_chart(
+        curves_table(run), [entry.id for entry in summary.finalists], summary.task.error
+    ).axes
     trained = sum(len(records) for name, records in run.retrainings().items() if name in ids)
     assert len(updates.lines) == len(seconds.lines) == trained
     assert [text.get_text() for text in seconds.get_legend().get_texts()] == sorted(ids)

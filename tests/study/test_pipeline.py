@@ -170,7 +170,7 @@ def test_the_ablation_goes_from_the_baseline_to_the_best_trained_finalist(run, s
     assert path[0].parameters == space.baseline
     assert len(path) > 1
     assert all(step.valid_error > 0 for step in path)
-    (density,) = [entry for entry in summary.ablation.branches if entry.change == "task.features.density"]
+    (density,) = [entry for entry in summary.ablation.toggled if entry.change == "task.features.density"]
     assert density.valid_error > 0
 
 

@@ -70,7 +70,7 @@ class IntegratedDensity(Check):
         return float(self._usual(alone).max())
 
     def _usual(self, deviations: Tensor) -> Tensor:
-        return deviations.abs().nan_to_num(math.inf).quantile(USUAL, dim=1)
+        return deviations.abs().nan_to_num(nan=math.inf, posinf=math.inf).quantile(USUAL, dim=1)
 
     def _integrated(self, rates: Tensor) -> Tensor:
         """Integral (T, N) of rates (T, N) from the first frame to each, by the trapezoidal rule."""

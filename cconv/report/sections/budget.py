@@ -16,4 +16,4 @@ class BudgetSection(Section):
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
         """Draw the learning curves of the finalists."""
-        return {"chart": budget_chart(records.curves, summary)}
+        return {"chart": budget_chart(records.curves, [entry.id for entry in summary.finalists], summary.task.error)}

@@ -1,6 +1,9 @@
 """The section on what the recommended model and the baseline learned: filters, a predicted frame, particle errors."""
 
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
 from cconv.report.sections.section import Records, Section
@@ -23,11 +26,20 @@ class LearnedSection(Section):
             "distribution": error_distribution_chart(explanations, summary.baseline, best),
             "models": {
                 name: {
-                    "filters": filters_chart(explanations[name]),
                     "fields": fields_chart(explanations[name], summary.task.symbol),
-                    "unexplained": float(explanations[name]["unexplained"]),
-                    "is_combined": bool(explanations[name]["is_combined"]),
+                    "filters": _filters(explanations[name]),
                 }
                 for name in names
             },
         }
+
+
+def _filters(explanation: Mapping[str, np.ndarray]) -> dict[str, Any] | None:
+    """Chart the filters and say how close they come; None for a network without filters."""
+    if "unexplained" not in explanation:
+        return None
+    return {
+        "chart": filters_chart(explanation),
+        "unexplained": float(explanation["unexplained"]),
+        "is_combined": bool(explanation["is_combined"]),
+    }

@@ -1,7 +1,7 @@
 """What a trial can vary: features that the network is given, settings of the network and of its training."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -25,6 +25,7 @@ HYPERPARAMETERS = (
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule")),
 )
 
+Settings = TypeVar("Settings", bound=StrictModel)
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 
 
@@ -46,6 +47,13 @@ class TaskConfig(StrictModel):
         if name not in KERNELS:
             raise ValueError(f"must be one of {', '.join(KERNELS)}")
         return name
+
+    @field_validator("features", mode="before")
+    @classmethod
+    def _features_are_listed(cls, features: object) -> object:
+        if isinstance(features, Mapping):
+            raise ValueError('must list the features that are taken, e.g. ["velocity", "density"]')
+        return features
 
     @model_validator(mode="after")
     def _features_are_of_the_task(self) -> "TaskConfig":
@@ -116,17 +124,24 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
     features = dict.fromkeys((*defaults.features, *(name for name in OPTIONAL_FEATURES if taken.get(name))))
     settings = ARCHITECTURES[architecture]
     kept = {name: value for name, value in defaults.network.model_dump().items() if name in settings.model_fields}
+    return Configuration(
+        tuple(name for name in features if taken.get(name, True)),
+        _possible(settings, NETWORK, kept | drawn),
+        _possible(TrainingConfig, TRAINING, defaults.training.model_dump() | below(TRAINING, parameters)),
+    )
+
+
+def _possible(form: type[Settings], table: str, values: Mapping[str, Value]) -> Settings:
+    """Settings of a table of the study file from plain values."""
     try:
-        return Configuration(
-            tuple(name for name in features if taken.get(name, True)),
-            settings.model_validate(kept | drawn),
-            TrainingConfig.model_validate(defaults.training.model_dump() | below(TRAINING, parameters)),
-        )
+        return form.model_validate(values)
     except ValidationError as error:
         problem = error.errors()[0]
-        where = ".".join(map(str, problem["loc"])) or "together"
+        where = ".".join(map(str, (table, *problem["loc"])))
         if problem["type"] == "extra_forbidden":
-            raise ConfigError(f"not possible ({where}: is no setting of {architecture})") from error
+            raise ConfigError(
+                f"not possible ({where}: is no setting of {values.get('architecture', table)})"
+            ) from error
         raise ConfigError(f"not possible ({where}: {problem['msg'].removeprefix('Value error, ')})") from error
 
 

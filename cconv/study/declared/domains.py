@@ -135,7 +135,7 @@ class SearchSpace(StrictModel):
         for name, parameter in self.parameters.items():
             for parent, values in parameter.when.items():
                 if problem := self._problem_of(parent, values):
-                    raise _at(("parameters", name, "when", parent), problem, values)
+                    raise _at(("parameters", name, "when", parent), problem, {})
         try:
             self.parents_first  # noqa: B018
         except CycleError as error:

@@ -76,7 +76,7 @@ def refine(space: SearchSpace, records: Sequence[TrialRecord], full_updates: int
         full_updates: Budget of a trial that was never stopped.
 
     Returns:
-        The refined space, and what became of each parameter of the old one, in words.
+        The refined space, and what was decided about each parameter of the old one, in words.
     """
     trained = _distinct([record for record in records if _counts(record)])
     domains, reasons = {}, {}

@@ -171,7 +171,7 @@ def recommend(
 def retrained_error(
     valid: Mapping[str, np.ndarray], test: Mapping[str, np.ndarray], choose: Callable[[Mapping], str]
 ) -> ExpectedError | None:
-    """Error to expect of the chosen model if it is trained again, free of the luck of the seeds that it was chosen by.
+    """Error to expect of the chosen model if it is trained again with other seeds than those that it was chosen by.
 
     Validation and test errors of a model share its trained networks: their mean test error is fair to these networks,
     but if seeds vary much and models little, the chosen one is the one with the lucky seeds. So each seed in turn is

@@ -1,4 +1,4 @@
-"""How much of the spread among configurations is the luck of initial weights (thesis, section 4.1)."""
+"""How much of the spread among configurations is due to the initial weights (thesis, section 4.1)."""
 
 import math
 from collections.abc import Sequence

@@ -104,8 +104,9 @@ def compare_strategies(
 ) -> list[ReplayedStrategy]:
     """ASHA, a little of each at every rung for the same updates, and no stopping, on redrawn trials in random order.
 
-    Each draw takes as many trials as there are, with replacement, so that the spread holds both the luck of the order
-    and that of the configurations. A little of each keeps as many trials as ASHA's mean updates pay for, at least one.
+    Each draw takes as many trials as there are, with replacement, so that the spread holds both the variance of the
+    order and that of the configurations. A little of each keeps as many trials as ASHA's mean updates pay for, at
+    least one.
 
     Args:
         curves: Learning curves up to the full budget, by trial.

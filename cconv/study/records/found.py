@@ -247,13 +247,13 @@ class Ablation(StrictModel):
         of: The best finalist.
         error: Its validation error, mean over the seeds.
         path: From the baseline to the best trained finalist, one change after the other.
-        branches: The best finalist with one optional feature removed or added; its path is the `change`.
+        toggled: The best finalist with one optional feature removed or added; its path is the `change`.
     """
 
     of: Id
     error: NonNegative
     path: tuple[AblationStep, ...]
-    branches: tuple[AblationStep, ...]
+    toggled: tuple[AblationStep, ...]
 
 
 class BudgetPoint(StrictModel):

@@ -78,8 +78,8 @@ class RunFolder:
         written = read_record(run.path / "study.json").get("format", 1)
         if written != FORMAT:
             raise DataError(
-                f"{run.path}: a run folder of format {written}, and this version of cconv reads format {FORMAT}; "
-                "run the study again, or open it with the version in its environment.json."
+                f"{run.path}: a run folder of format {shown(written)}, and this version of cconv reads format "
+                f"{FORMAT}; run the study again, or open it with the version in its environment.json."
             )
         return run
 

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -24,8 +25,6 @@ os.environ.update(
 import ray  # noqa: E402, its settings are read at import
 from ray import tune  # noqa: E402
 from ray.exceptions import RayError  # noqa: E402
-from ray.tune.execution.tune_controller import TuneController  # noqa: E402
-from ray.tune.experiment import Trial as RayTrial  # noqa: E402
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler  # noqa: E402
 from ray.tune.search import Searcher  # noqa: E402
 
@@ -44,6 +43,10 @@ from cconv.study.running.private_ray import (  # noqa: E402
 from cconv.study.running.problem import Problem  # noqa: E402
 from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, train_recorded  # noqa: E402
 from cconv.study.running.trial_queue import Job, TrialQueue  # noqa: E402
+
+if TYPE_CHECKING:  # inner names of Ray, which a release may move
+    from ray.tune.execution.tune_controller import TuneController
+    from ray.tune.experiment import Trial as RayTrial
 
 QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # what fails is in our records
 OBJECT_STORE_BYTES = 2**30
@@ -213,12 +216,12 @@ class _Driver(_NeverRestored, tune.Callback):
         with self._ends_the_run() as queue:
             return queue.next()
 
-    def goes_on(self, trial: RayTrial, result: dict) -> bool:
+    def goes_on(self, trial: "RayTrial", result: dict) -> bool:
         """Whether a trial goes on after an evaluation; a last word of the training is none."""
         with self._ends_the_run() as queue:
             return result["outcome"] is not None or queue.on_result(str(trial), result)
 
-    def on_trial_complete(self, iteration: int, trials: list[RayTrial], trial: RayTrial, **info: object) -> None:
+    def on_trial_complete(self, iteration: int, trials: list["RayTrial"], trial: "RayTrial", **info: object) -> None:
         """A training said how it ended, or was stopped after its last evaluation."""
         last = trial.last_result
         with self._ends_the_run() as queue:
@@ -226,7 +229,7 @@ class _Driver(_NeverRestored, tune.Callback):
                 raise disk_is_full(trial.config["job"], last["reason"])
             queue.on_end(str(trial), last["outcome"] or queue.outcome_after(last), last["reason"])
 
-    def on_trial_error(self, iteration: int, trials: list[RayTrial], trial: RayTrial, **info: object) -> None:
+    def on_trial_error(self, iteration: int, trials: list["RayTrial"], trial: "RayTrial", **info: object) -> None:
         """The training's process or node died too often."""
         with self._ends_the_run() as queue:
             queue.on_end(str(trial), "failed", f"its process or node died {RESTARTS + 1} times")
@@ -258,7 +261,7 @@ class _Judge(_NeverRestored, FIFOScheduler):
         super().__init__()
         self._driver = driver
 
-    def on_trial_result(self, tune_controller: TuneController, trial: RayTrial, result: dict) -> str:
+    def on_trial_result(self, tune_controller: "TuneController", trial: "RayTrial", result: dict) -> str:
         """Ask the queue."""
         return TrialScheduler.CONTINUE if self._driver.goes_on(trial, result) else TrialScheduler.STOP
 

@@ -50,7 +50,7 @@ class AblationStage(Stage):
             of=best.id,
             error=_mean_error(best),
             path=[_step(session, f"{name}_{change}", change, each) for change, each in path.items()],
-            branches=[
+            toggled=[
                 _step(session, f"{name}_{feature}", feature_path(feature), each) for feature, each in variants.items()
             ],
         )

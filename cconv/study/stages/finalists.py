@@ -3,6 +3,7 @@
 The select stage evaluates, times and compares them with the functions at the end of this file.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,11 +190,18 @@ def evaluate_finalist(
 
     Returns:
         The mean errors, and the errors of each seed and unit (seeds, units).
+
+    Raises:
+        StudyError: If a prediction is not finite.
     """
     tables = [objective.table(load_model(each), samples, frames_per_block) for each in finalist.checkpoints]
     by_seed = [table.error for table in tables]
     units = np.stack([table.units for table in tables])
     mean = float(np.mean(by_seed))
+    if not math.isfinite(mean):
+        raise StudyError(
+            f"finalist {finalist.id}: its predictions on a split are not finite; leave it out, or train it anew."
+        )
     interval = crossed_interval(units)
     facts = Errors(
         error=mean,

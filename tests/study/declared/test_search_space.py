@@ -251,7 +251,7 @@ def costing(flops):
         ),
         (
             ARCHITECTURE.replace('= "conv_net"', '= "radial_net"') + SKIP,
-            r"the baseline is not possible .skip: Input should be 'before_activation'",
+            r"the baseline is not possible .network.skip: Input should be 'before_activation'",
         ),
         (
             FLOAT.replace("1e-2]", "inf]"),
@@ -295,7 +295,8 @@ def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
     study = load_study(REPOSITORY / "experiments" / "smoke.toml", ["network.skip=after_activation"])
     load_space(path)
     with pytest.raises(
-        ConfigError, match="`parameters.network.architecture`: the value 'radial_net' is not possible .skip: Input"
+        ConfigError,
+        match="`parameters.network.architecture`: the value 'radial_net' is not possible .network.skip: Input",
     ):
         load_space(path, study)
 

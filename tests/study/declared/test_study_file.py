@@ -154,11 +154,14 @@ def test_names_that_could_be_taken_for_others_are_refused(stages, message, study
     ("parameters", "message"),
     [
         ("{ layers = 2 }", "finalist `x`: unknown hyperparameter 'layers'. Did you mean 'network.layers'"),
-        ("{ network.layers = 99 }", r"finalist `x`: not possible .layers: Input should be less than or equal to 16"),
-        ("{ network.layers = true }", r"finalist `x`: not possible .layers: Input should be a valid integer"),
+        (
+            "{ network.layers = 99 }",
+            r"finalist `x`: not possible .network.layers: Input should be less than or equal to 16",
+        ),
+        ("{ network.layers = true }", r"finalist `x`: not possible .network.layers: Input should be a valid integer"),
         (
             '{ network.architecture = "radial_net", network.skip = "after_activation" }',
-            "finalist `x`: not possible .skip: Input should be",
+            "finalist `x`: not possible .network.skip: Input should be",
         ),
         ("{ training.learning_rate = inf }", r"include\.x\.training\.learning_rate`: must be true, false, a number"),
         ("{ network.layers = [1] }", r"include\.x\.network\.layers`: must be true, false, a number"),
