@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from cconv.data.trajectory import Boundary, ParticleType, Trajectory
-from cconv.errors import DataError
+from cconv.domain import Box
+from cconv.errors import DataError, ShapeError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +40,18 @@ class Window:
 
     @property
     def is_fluid(self) -> Tensor:
-        """Which particles a model moves, (N,), bool; the others move as prescribed."""
+        """Which particles a model moves, (N,), bool."""
         return self.particle_types == ParticleType.FLUID
+
+    def last_displacements(self, box: Box) -> Tensor:
+        """Displacement of each particle from the frame before the present one, (N, D), float64.
+
+        Raises:
+            ShapeError: If there is no frame before it.
+        """
+        if len(self.positions) < 2:
+            raise ShapeError(f"a window must have at least 2 frames up to the present, got {len(self.positions)}.")
+        return box.displacement(self.present.double(), self.positions[-2].double())
 
     def followed_by(self, positions: Tensor) -> "Window":
         """The window a frame later, whose present is `positions` (N, D); as long as this one."""

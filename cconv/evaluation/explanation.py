@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 import torch
@@ -257,9 +258,8 @@ def _filter_units(sample: Sample) -> Tensor:
     """Return the unit of the filters of each feature, in the units of the data, (F, 1)."""
     units, features = sample.inputs.units, sample.inputs.features
     of_name = {DENSITY: units.density, VELOCITY: units.velocity}
-    scalars = [of_name.get(name, 1.0) for name in features.scalar_names]
-    vectors = [of_name[name] for name in features.vector_names for _ in range(features.vectors.shape[2])]
-    return (sample.target_unit / torch.tensor([*scalars, *vectors]).double())[:, None]
+    per_column = [of_name.get(name, 1.0) for name in features.columns]
+    return (sample.target_unit / torch.tensor(per_column).double())[:, None]
 
 
 def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
@@ -316,12 +316,8 @@ def _read_features(analytic: Tensor) -> Tensor:
 
 
 def _read_names(analytic: Tensor, features: Features) -> set[str]:
-    """Names of the features that the analytic operator reads; each component of a vector has its name."""
-    names = [
-        *features.scalar_names,
-        *(name for name in features.vector_names for _ in range(features.vectors.shape[2])),
-    ]
-    return {name for name, is_read in zip(names, _read_features(analytic), strict=True) if is_read}
+    """Names of the features that the analytic operator reads."""
+    return set(compress(features.columns, _read_features(analytic).tolist()))
 
 
 def _on_axes(filters: Tensor, pairs: _Pairs) -> Tensor:

@@ -78,6 +78,12 @@ class Features:
         """Numbers of scalars and vectors."""
         return Kinds(len(self.scalar_names), len(self.vector_names))
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Name of the scalar or vector that each column of `flat` belongs to, S + V · D."""
+        dim = self.vectors.shape[2]
+        return self.scalar_names + tuple(name for name in self.vector_names for _ in range(dim))
+
     def flat(self) -> Float[Tensor, "N C"]:
         """Scalars and the components of the vectors, (N, S + V · D)."""
         return join_kinds(self.scalars, self.vectors)
