@@ -21,6 +21,6 @@ def __getattr__(name: str) -> Any:
     # Loaded when first used: torch takes seconds, and `cconv --help` needs none of it.
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    if name in ("networks", "nn", "sph"):
+    if name in ("networks", "nn", "rollout", "sph"):
         return import_module(f"cconv.{name}")
     raise AttributeError(f"module 'cconv' has no attribute {name!r}")

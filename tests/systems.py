@@ -5,6 +5,7 @@ import math
 import torch
 
 from cconv.data.trajectory import Boundary, Frame, Scene, Trajectory
+from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.models.model import Model, build_model
 from cconv.networks import ARCHITECTURES
@@ -12,7 +13,8 @@ from cconv.sph.kernels import CubicSpline
 from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
-from cconv.tasks.samples import Sample, make_sample
+from cconv.tasks.samples import Sample, make_sample, make_step_sample
+from cconv.tasks.task import StepTask, as_field
 
 
 def periodic_scene(particles_per_side: int = 8) -> Scene:
@@ -78,6 +80,33 @@ def with_walls(frame: Frame, normals: bool = True) -> Frame:
     )
 
 
+def window_of(frame: Frame, generator: torch.Generator, history: int = 6, future: int = 1) -> Window:
+    """Frames of smooth motion that end with the particles and walls of a frame, and some that follow."""
+    times = torch.arange(1 - history, future + 1)[:, None, None]
+    jitter = torch.rand(len(times), *frame.positions.shape, generator=generator) - 0.5
+    path = frame.positions + 0.01 * times * frame.velocities + 0.001 * jitter * (times != 0)
+    return Window(
+        positions=path[:history],
+        future=path[history:],
+        masses=frame.masses,
+        particle_types=frame.particle_types,
+        boundary=frame.boundary,
+        trajectory="0",
+        frame=history - 1,
+    )
+
+
+def observed_and_sample(
+    frame: Frame, scene: Scene, task: str, generator: torch.Generator
+) -> tuple[Frame | Window, Sample]:
+    """What a model of a task is asked about, a frame or a window that ends with it, and the sample of that."""
+    asked = task_named(task)
+    if isinstance(asked, StepTask):
+        window = window_of(frame, generator)
+        return window, make_step_sample(window, scene, asked)
+    return frame, make_sample(frame, scene, as_field(asked))
+
+
 def kernel(scene: Scene) -> CubicSpline:
     """The scene's cubic spline with h = spacing."""
     return CubicSpline(scene.particle_spacing, scene.dim)
@@ -121,6 +150,8 @@ def model_of(
     train_samples: list[Sample],
     generator: torch.Generator | None = None,
 ) -> Model:
-    """A fresh model of a density task."""
+    """A fresh model of a task, with all features for one that knows others than the configuration."""
     asked = task_named(task)
-    return build_model(configuration.network, asked, configuration.features, scene, train_samples, generator)
+    known = set(configuration.features) <= set(asked.features)
+    features = configuration.features if known else asked.features
+    return build_model(configuration.network, asked, features, scene, train_samples, generator)

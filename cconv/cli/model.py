@@ -80,11 +80,15 @@ def fit(
     from cconv.models.closed_form import solve_closed_form
     from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
+    from cconv.training.losses import LOSSES
 
     check_setting(Ridge, ridge, "--ridge")
     config, problem, dataset = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.configuration, config.seeds.init)
-    solve_closed_form(model, problem.train_samples, ridge, lambda samples: show_progress(samples, "fit"))
+    training = config.training
+    examples = problem.examples(training, config.seeds.data)
+    samples = (examples.draw(index, 0) for index in show_progress(range(len(examples)), "fit"))
+    solve_closed_form(model, samples, ridge, weight=LOSSES[training.loss])
     error = problem.objective.error(model, show_progress(problem.valid_samples, "validate"))
     card = {
         "stage": "closed_form",
@@ -126,7 +130,7 @@ def evaluate(
     """
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
-    from cconv.tasks.samples import iterate_samples
+    from cconv.tasks.samples import compared_samples
 
     model, card = load_model(checkpoint, task), read_card(checkpoint)
     given = {
@@ -139,7 +143,7 @@ def evaluate(
 
     def samples(split: str, verb: str) -> list:
         label = f"{verb} {split}"
-        return list(show_progress(iterate_samples(dataset, split, model.task), label))
+        return list(show_progress(compared_samples(dataset, split, model.task), label))
 
     asked = samples(split, "read")
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None

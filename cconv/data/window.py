@@ -43,15 +43,26 @@ class Window:
         """Which particles a model moves, (N,), bool."""
         return self.particle_types == ParticleType.FLUID
 
+    def displacements(self, box: Box, history: int) -> Tensor:
+        """Displacement of each particle from frame to frame of the last `history` ones, (history - 1, N, D), float64.
+
+        Raises:
+            ShapeError: If the window has fewer frames.
+        """
+        if not 2 <= history <= len(self.positions):
+            raise ShapeError(
+                f"a window must have at least {history} frames up to the present, got {len(self.positions)}."
+            )
+        last = self.positions[-history:].double()
+        return box.displacement(last[1:], last[:-1])
+
     def last_displacements(self, box: Box) -> Tensor:
         """Displacement of each particle from the frame before the present one, (N, D), float64.
 
         Raises:
             ShapeError: If there is no frame before it.
         """
-        if len(self.positions) < 2:
-            raise ShapeError(f"a window must have at least 2 frames up to the present, got {len(self.positions)}.")
-        return box.displacement(self.present.double(), self.positions[-2].double())
+        return self.displacements(box, 2)[0]
 
     def followed_by(self, positions: Tensor) -> "Window":
         """The window a frame later, whose present is `positions` (N, D); as long as this one."""

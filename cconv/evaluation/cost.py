@@ -22,7 +22,7 @@ from cconv.ops.workers import torch_threads
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
 from cconv.tasks.features import FluidState, Inputs
-from cconv.tasks.task import FieldTask
+from cconv.tasks.task import FieldTask, as_field
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
 
@@ -304,7 +304,7 @@ def _block_call(model: Model, size: int) -> Call:
 
 def _analytic_block_call(field: ModelConfig, size: int) -> Call:
     frame, scene = fluid_block(size, field)
-    task = task_named(field.task, field.kernel, field.relative_smoothing_length)
+    task = as_field(task_named(field.task, field.kernel, field.relative_smoothing_length))
     return _analytic_call(task, [frame], scene)
 
 

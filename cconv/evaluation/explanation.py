@@ -27,6 +27,7 @@ from cconv.nn.kinds import split_kinds
 from cconv.sph.operators import density
 from cconv.tasks.features import DENSITY, VELOCITY, Features, FluidState, Inputs
 from cconv.tasks.samples import Sample
+from cconv.tasks.task import as_field
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 _POINTS_ON_LINE, _RADII, _BINS_PER_DECADE = 161, 80, 5
@@ -220,7 +221,7 @@ def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
             box=None,
             kernel=kernel,
         )
-        answers = model.task.field(state.knowing(edges, _named(features, DENSITY)))
+        answers = as_field(model.task).field(state.knowing(edges, _named(features, DENSITY)))
         return answers[: len(pairs.displacements)]
 
     return torch.stack([answer(raised) for raised in _raised(rest)], dim=1)

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+import torch
 
 from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
+from cconv.evaluation.rollout_errors import constant_rollouts, rollouts_of
 from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
-from cconv.tasks.task import FieldTask
+from cconv.tasks.task import Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +116,55 @@ class NormalizedMSE(Objective):
         return normalized_mse(mean_predictor_error(samples, train_samples))
 
 
-OBJECTIVES: dict[str, Objective] = {objective.name: objective() for objective in (NormalizedMSE,)}
+class RolloutMSE(Objective):
+    """Mean squared error of the positions of rollouts, over their frames, particles and components."""
+
+    name = "rollout_mse"
+    label = "rollout MSE"
+    meaning = (
+        "Mean squared error of the positions while the model is rolled out by its own answers, over all frames of the "
+        "rollouts, particles and components, in squared lengths of the data (LagrangeBench's MSE_n). A frame that a "
+        "rollout does not reach, because it diverged, and one that is farther off, count as the error of half the box."
+    )
+    measures = {
+        "first-frame MSE": "The first-frame MSE is that of the first frame of each rollout, the error of a single "
+        "step, which says little about stability.",
+        "diverged rollouts": "Diverged rollouts are the share of rollouts that did not reach their last frame.",
+    }
+
+    def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
+        """Error over all rollouts; arguments as of `Objective.error`."""
+        return float(np.mean([rolled.error for rolled in rollouts_of(model, samples)]))
+
+    def table(self, model: Model, samples: Sequence[Sample], frames_per_block: int) -> ErrorTable:
+        """Errors over the rollouts; a unit is a trajectory, or a rollout if there is one trajectory alone."""
+        rolled = rollouts_of(model, samples)
+        names = [each.trajectory for each in rolled]
+        errors = np.array([each.error for each in rolled])
+        groups = [[name == each for each in names] for name in dict.fromkeys(names)]
+        return ErrorTable(
+            error=float(errors.mean()),
+            units=np.array([errors[group].mean() for group in groups]) if len(groups) > 1 else errors,
+            measures={
+                "first-frame MSE": float(np.mean([each.errors[0] for each in rolled])),
+                "diverged rollouts": float(np.mean([each.diverged is not None for each in rolled])),
+            },
+        )
+
+    def in_words(self, error: float) -> str:
+        """Express the error as a distance."""
+        return f"a typical distance of {math.sqrt(error):.3g} from the true position along each axis"
+
+    def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
+        """Return the error of always answering the mean over the training split."""
+        answers = torch.cat([(each.target * each.target_unit).double() for each in train_samples])
+        mean = answers.mean(dim=0)
+        return float(np.mean([each.error for each in constant_rollouts(mean, samples)]))
 
 
-def objective_of(task: FieldTask) -> Objective:
+OBJECTIVES: dict[str, Objective] = {objective.name: objective() for objective in (NormalizedMSE, RolloutMSE)}
+
+
+def objective_of(task: Task) -> Objective:
     """Return the objective that a task names."""
     return OBJECTIVES[task.objective]

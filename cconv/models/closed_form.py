@@ -12,7 +12,9 @@ from cconv.models.model import Model, build_model
 from cconv.networks import RadialNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.tasks import task_named
+from cconv.tasks.features import Inputs
 from cconv.tasks.samples import Sample, iterate_samples
+from cconv.tasks.task import as_field
 
 
 class NormalEquations:
@@ -80,7 +82,7 @@ def fit_closed_form(
         ConfigError: If the network has several layers, or the terms depend on each other and `ridge` is too small.
     """
     spacing = dataset.scene.particle_spacing
-    asked = task_named(task, kernel, 1.0 if smoothing_length is None else smoothing_length / spacing)
+    asked = as_field(task_named(task, kernel, 1.0 if smoothing_length is None else smoothing_length / spacing))
     if network is None:
         reach = asked.kernel_at(1.0, dataset.scene.dim).support_radius
         network = RadialNetSettings(layers=1, message="difference", relative_cutoff=reach)
@@ -91,9 +93,20 @@ def fit_closed_form(
 
 
 def solve_closed_form(
-    model: Model, samples: Sequence[Sample], ridge: float = 1e-10, progress: Callable[[Iterable], Iterable] = iter
+    model: Model,
+    samples: Iterable[Sample],
+    ridge: float = 1e-10,
+    progress: Callable[[Iterable], Iterable] = iter,
+    weight: Callable[[Tensor], float] = lambda target: 1.0,
 ) -> None:
     """Set the coefficients of a model of a single layer to the least-squares solution on `samples`, in place.
+
+    Args:
+        model: Model whose network has one layer.
+        samples: Samples to fit.
+        ridge: Weight of the squared coefficients, in mean squares of a term.
+        progress: Wraps the samples, e.g. with a progress bar.
+        weight: How much a frame's squared error counts, by its standardised target.
 
     Raises:
         ConfigError: If the network has several layers, `ridge` is negative, or the terms depend on each other and
@@ -106,9 +119,18 @@ def solve_closed_form(
     for sample in progress(samples):
         inputs = sample.inputs.double()
         terms = layer.terms(*model.network_inputs(inputs, model.geometry(inputs)))
-        targets = layer.targets(model.standardize_target(sample.target.double()))
+        terms = [_answered(rows, inputs) for rows in terms]
+        target = model.standardize_target(sample.target.double())
+        targets, root = layer.targets(target), weight(target) ** 0.5
         if not equations:
             equations = [NormalEquations(x.shape[1], y.shape[1]) for x, y in zip(terms, targets, strict=True)]
         for system, x, y in zip(equations, terms, targets, strict=True):
-            system.add(x, y)
+            system.add(root * x, root * y)
     layer.assign([system.solve(ridge) for system in equations])
+
+
+def _answered(rows: Float[Tensor, "R P"], inputs: Inputs) -> Float[Tensor, "R P"]:
+    """Rows of the particles that are asked about, which have one row each, or one for each component."""
+    if inputs.answered is None:
+        return rows
+    return rows[inputs.answered.repeat_interleave(len(rows) // inputs.num_particles)]

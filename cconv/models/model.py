@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from cconv.data.trajectory import Frame, Scene
+from cconv.data.window import Window
 from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
 from cconv.neighbors import radius_graph
@@ -20,9 +21,9 @@ from cconv.nn.kinds import Kinds
 from cconv.ops.workers import results_of
 from cconv.sph.kernels import KERNELS, AbstractKernel
 from cconv.tasks import TASKS, task_named
-from cconv.tasks.features import CONSTANT, WALLS, Inputs, kinds_of
+from cconv.tasks.features import CONSTANT, WALLS, Inputs
 from cconv.tasks.samples import Sample
-from cconv.tasks.task import FieldTask
+from cconv.tasks.task import Task
 from cconv.validation import Length, StrictModel, Whole
 
 MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
@@ -33,7 +34,8 @@ class ModelConfig(StrictModel):
 
     The network computes in particle spacings, rest densities and frame intervals (`cconv.tasks.features.Units`).
     `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` is the spacing of the
-    training data, for the record. `features` names the features of the task that are inputs of the model.
+    training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
+    features of the task that are inputs of the model.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     """
 
@@ -42,6 +44,7 @@ class ModelConfig(StrictModel):
     relative_smoothing_length: Length
     dim: Whole = Field(ge=1, le=3)
     particle_spacing: Length
+    history: Whole = 1
     features: tuple[str, ...] = Field(max_length=100)
     wall_scalars: Whole = Field(ge=0, le=1)
     wall_vectors: Whole = Field(ge=0, le=1)
@@ -53,11 +56,17 @@ class ModelConfig(StrictModel):
             if name not in known:
                 raise ValueError(f"`{what}` must be one of {', '.join(known)}, got {shown(name)}")
         TASKS[self.task].check_features(self.features)
+        TASKS[self.task].check_history(self.history)
         if (self.wall_scalars or self.wall_vectors) and WALLS not in self.features:
             raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
         return self
+
+    @property
+    def asked(self) -> Task:
+        """Task of the model."""
+        return task_named(self.task, self.kernel, self.relative_smoothing_length, self.history)
 
     @property
     def fluid_features(self) -> tuple[str, ...]:
@@ -67,7 +76,7 @@ class ModelConfig(StrictModel):
     @property
     def inputs(self) -> Kinds:
         """Numbers of input features of a fluid particle."""
-        return kinds_of(self.fluid_features)
+        return self.asked.kinds(self.fluid_features)
 
     @property
     def walls(self) -> Kinds | None:
@@ -123,7 +132,7 @@ class Model(nn.Module):
     ):
         super().__init__()
         self.config = config
-        self.task: FieldTask = task_named(config.task, config.kernel, config.relative_smoothing_length)
+        self.task = config.asked
         self.settings: NetworkSettings = config.network
         self.network: Network[Any] = config.network.build(
             config.inputs, config.walls, config.output, config.dim, generator
@@ -165,9 +174,10 @@ class Model(nn.Module):
         fluid, *walls = map(self.settings.geometry, results_of(searches))
         return FrameGeometry(fluid, walls[0] if walls else None)
 
-    def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "N C"]:
-        """Standardised prediction (N, C)."""
-        return self.network(*self.network_inputs(inputs, geometry))
+    def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "M C"]:
+        """Standardised prediction (M, C) for the particles that are asked about."""
+        values = self.network(*self.network_inputs(inputs, geometry))
+        return values if inputs.answered is None else values[inputs.answered]
 
     def network_inputs(
         self, inputs: Inputs, geometry: FrameGeometry
@@ -185,17 +195,22 @@ class Model(nn.Module):
         return (target - self.target_mean) / self.target_scale
 
     @torch.no_grad()
-    def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_particles} C"]:
-        """Prediction (N, C) in the units of the data that the inputs were made of."""
+    def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_answers} C"]:
+        """Prediction (M, C) in the units of the data that the inputs were made of."""
         field = self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
         return field * self.task.unit(inputs.units)
 
-    def predict_frame(self, frame: Frame, scene: Scene) -> Float[Tensor, "N C"]:
-        """Prediction (N, C) at the fluid particles of a frame of a data set, in the units of the data."""
+    def predict_frame(self, frame: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
+        """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data.
+
+        Args:
+            frame: A frame for a model of a field, a window up to the present frame for a model of a step.
+            scene: Its scene.
+        """
         return self.predict(self.inputs(frame, scene))
 
-    def inputs(self, frame: Frame, scene: Scene) -> Inputs:
-        """Compute the inputs of a frame of a data set, only the features that the model takes."""
+    def inputs(self, frame: Frame | Window, scene: Scene) -> Inputs:
+        """Compute the inputs of a frame or window, only the features that the model takes."""
         return self.task.inputs(frame, scene, self.config.features)
 
     def _check(self, inputs: Inputs) -> None:
@@ -218,7 +233,7 @@ def _in_words(walls: Kinds | None) -> str:
 
 def build_model(
     network: NetworkSettings,
-    task: FieldTask,
+    task: Task,
     features: Collection[str],
     scene: Scene,
     train_samples: Sequence[Sample],
@@ -241,12 +256,14 @@ def build_model(
     walls = (given.wall_kinds if WALLS in features else None) or Kinds(0, 0)
     names = {CONSTANT, *features}
     task.check_features(names)
+    names -= _absent(task, names, train_samples)
     config = ModelConfig(
         task=task.name,
         kernel=task.kernel,
         relative_smoothing_length=task.relative_smoothing_length,
         dim=scene.dim,
         particle_spacing=scene.particle_spacing,
+        history=task.history,
         features=tuple(name for name in task.features if name in names),
         wall_scalars=walls.scalars,
         wall_vectors=walls.vectors,
@@ -260,6 +277,18 @@ def build_model(
     standardization = standardize_features(taken, center_vectors=not turns)
     without_weights(config)
     return Model(config, standardization, targets, generator)
+
+
+def _absent(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:
+    """Optional features that are 0 in all samples, or that none has, such as a force in a scene without one."""
+    unseen = {name for name in names if name in task.optional and name != WALLS}
+    for sample in samples:
+        if not unseen:
+            break
+        features = sample.inputs.features
+        flat = features.flat().abs().amax(dim=0) > 0
+        unseen -= {name for name, seen in zip(features.columns, flat.tolist(), strict=True) if seen}
+    return unseen
 
 
 def without_weights(config: ModelConfig) -> Model:

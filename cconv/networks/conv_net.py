@@ -216,6 +216,7 @@ class ConvNetSettings(ConvolutionSettings):
     linear_settings = (*ConvolutionSettings.linear_settings, basis_size, "mapping", "interpolation", "align_corners")
 
     architecture: Literal["conv_net"] = "conv_net"
+    message: Literal["absolute", "difference"] = "absolute"
     kernel_size: Whole = Field(4, ge=1, le=32)
     mapping: Literal["identity", "ball_to_cube_radial", "ball_to_cube_volume_preserving"] = (
         "ball_to_cube_volume_preserving"

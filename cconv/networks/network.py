@@ -247,7 +247,7 @@ class ConvolutionSettings(NetworkSettings):
     hidden_channels: Whole = Field(64, ge=1, le=4096)
     window: Literal["none", "poly6", "gaussian", "cubic_spline"] = "poly6"
     normalize: Flag = False
-    message: Literal["absolute", "difference"] = "absolute"
+    message: Literal["absolute", "difference", "mixed", "opposite"] = "absolute"
     activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
 
     @property

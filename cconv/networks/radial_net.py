@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import zip_longest
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from cconv.errors import check_choice
+from cconv.errors import ConfigError, check_choice
 from cconv.neighbors import Edges
 from cconv.networks.conv_net import ACTIVATIONS
 from cconv.networks.counting import (
@@ -38,7 +39,7 @@ from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.nn.radial_conv import RadialConv, RadialGeometry
 from cconv.ops.convolution import columns
 from cconv.ops.radial import MOST_OUTPUTS
-from cconv.validation import Whole
+from cconv.validation import Flag, Whole
 
 
 class VectorLinear(nn.Module):
@@ -89,9 +90,11 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         num_terms: Number of radial terms B.
         dim: Number of space dimensions D.
         activation: "relu", "gelu", "tanh" or "leaky_relu", of scalars.
-        message: "absolute" or "difference", of all fluid convolutions.
+        message: Name in `cconv.nn.radial_conv.MESSAGES`, of all fluid convolutions.
+        conserves_momentum: Whether the last layer only adds what pairs of particles give to each other with opposite
+            signs, so that predicted vectors have the sum 0 over all particles. It has "opposite" messages and no
+            linear map then.
         residual: Whether outputs of layers of equal width are added up.
-        bias: Whether scalars have biases; without them equal features give 0 by differences.
         generator: Source of the initial weights; None for torch's global one.
 
     Raises:
@@ -106,8 +109,8 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         *,
         activation: str = "relu",
         message: str = "absolute",
+        conserves_momentum: bool = False,
         residual: bool = True,
-        bias: bool = True,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
@@ -119,12 +122,16 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         outputs = [*(Kinds(scalars + vectors, vectors) for scalars, vectors in hidden), last]  # a gate for each vector
         conv_of = partial(RadialConv, num_terms=num_terms, dim=dim, bias=False, generator=generator)
         self.boundary_conv = None if channels.walls is None else conv_of(channels.walls, outputs[0])
+        messages = [*[message] * len(hidden), "opposite" if conserves_momentum else message]
         self.convs = Layers(
-            conv_of(before, after, message=message) for before, after in zip(inputs, outputs, strict=True)
+            conv_of(before, after, message=sent) for before, after, sent in zip(inputs, outputs, messages, strict=True)
         )
-        mapped = zip([self.own_channels, *hidden], outputs, strict=True)
+        has_bias = message != "difference" or last.vectors > 0  # a scalar of equal features is 0 by differences
+        mapped = list(zip([self.own_channels, *hidden], outputs, strict=True))
         self.dense = Layers(
-            VectorLinear(before, after, dim, bias, generator) for before, after in mapped if any(before)
+            VectorLinear(before, after, dim, has_bias, generator)
+            for before, after in (mapped[:-1] if conserves_momentum else mapped)
+            if any(before)
         )
 
     @property
@@ -151,9 +158,10 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         for conv, seen in with_inputs(self.boundary_conv, walls):
             output = output + conv(seen.features, seen.geometry)
         following_dense = self.dense[any(self.own_channels) :]
-        for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
+        for channels, conv, dense in zip_longest(self.hidden_channels, self.convs[1:], following_dense):
             activated = self._activate(output, channels)
-            following = conv.convolve(activated, geometry) + dense(activated)
+            following = conv.convolve(activated, geometry)
+            following = following if dense is None else following + dense(activated)
             output = following + output if self.residual and following.shape == output.shape else following
         return output
 
@@ -229,12 +237,21 @@ class RadialNetSettings(ConvolutionSettings):
 
     architecture: Literal["radial_net"] = "radial_net"
     radial_terms: Whole = Field(16, ge=1, le=512)
+    conserves_momentum: Flag = False
     skip: Literal["before_activation", "none"] = "before_activation"
+
+    @model_validator(mode="after")
+    def _pairs_weigh_each_other_alike(self) -> "RadialNetSettings":
+        if self.conserves_momentum and self.normalize:
+            raise ValueError("`conserves_momentum` needs `normalize = false`: ψ differs between the two of a pair")
+        return self
 
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> RadialNet:
         """The network with fresh weights; arguments as of `NetworkSettings.build`."""
+        if self.conserves_momentum and outputs.scalars:
+            raise ConfigError("`network.conserves_momentum` must be false where a scalar is predicted.")
         layers = (*(Kinds(width, width) for width in self.hidden_widths), outputs)
         return RadialNet(
             Channels(self.sent(inputs), layers, walls=walls, own=self.own(inputs, outputs)),
@@ -242,8 +259,8 @@ class RadialNetSettings(ConvolutionSettings):
             dim,
             activation=self.activation,
             message=self.message,
+            conserves_momentum=self.conserves_momentum,
             residual=self.skip == "before_activation",
-            bias=self.has_intercept(outputs),
             generator=generator,
         )
 
@@ -266,7 +283,20 @@ class RadialNetSettings(ConvolutionSettings):
         convs = [CountedConv(*kinds, fluid) for kinds in zip(before, after, strict=True)]
         if walls is not None:
             convs.append(CountedConv(walls, after[0], boundary))
-        return convs, [kinds for kinds in mapped if any(kinds[0])]
+        maps = list(mapped)[: len(after) - self.conserves_momentum]
+        return convs, [kinds for kinds in maps if any(kinds[0])]
+
+    def own(self, inputs: Kinds, outputs: Kinds) -> Kinds:
+        """Return the inputs of the first layer's linear map; see `ConvolutionSettings.own`.
+
+        Where scalars are sent as they are and vectors as differences, the last vector, a velocity, is left out: the
+        network then does not see at which velocity the whole scene moves. A single layer that conserves momentum has
+        no such map.
+        """
+        if self.conserves_momentum and self.layers == 1:
+            return Kinds(0, 0)
+        own = super().own(inputs, outputs)
+        return own if self.message in ("absolute", "difference") else Kinds(own.scalars, max(0, own.vectors - 1))
 
     def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
         """Pairs read the filters of all outputs themselves where these are few; else messages are written down."""

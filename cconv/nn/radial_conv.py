@@ -12,6 +12,11 @@ grid filters are in each coordinate. D2 and D3 of SPH are of this form, with φ 
 
 These are all contributions that are linear in one message: see Villar et al., "Scalars are universal: Equivariant
 machine learning, structured like classical physics" (NeurIPS 2021).
+
+A message is f_j + σ f_i with a σ for scalars and one for vectors. "mixed" messages are scalars as they are and
+differences of vectors, so that velocities matter only relative to each other. "opposite" messages are sums of scalars
+and differences of vectors: what two particles add to each other's vectors is equal and opposite, so that its sum over
+all particles is 0.
 """
 
 from collections.abc import Iterator
@@ -25,7 +30,6 @@ from torch import Tensor, nn
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
 from cconv.neighbors import Edges
 from cconv.nn.continuous_conv import (
-    MESSAGES,
     check_finite,
     check_kind,
     importance,
@@ -36,6 +40,8 @@ from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.ops import radial
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
+
+MESSAGES = {"absolute": (0, 0), "difference": (-1, -1), "sum": (1, 1), "mixed": (0, -1), "opposite": (1, -1)}
 
 
 class RadialGeometry:
@@ -143,10 +149,10 @@ class RadialGeometry:
         Returns:
             For scalars s and r̂ · v, (E, S + V); for vectors s r̂, v and (r̂ · v) r̂, (D, E, S + 2V).
         """
-        values = features[self.senders]
-        if MESSAGES[message]:
-            values = values + MESSAGES[message] * features[self.receivers]
-        scalars, vectors = split_kinds(values, channels, self.dim)
+        scalars, vectors = (
+            values[self.senders] + own * values[self.receivers] if own else values[self.senders]
+            for values, own in zip(split_kinds(features, channels, self.dim), MESSAGES[message], strict=True)
+        )
         along = torch.einsum("evd,ed->ev", vectors, self.directions)
         directed = torch.cat([scalars, along], dim=1)[:, :, None] * self.directions[:, None, :]
         to_scalars = torch.cat([scalars, along], dim=1)
@@ -166,7 +172,7 @@ class RadialConv(nn.Module):
         num_terms: Number of radial terms B.
         dim: Number of space dimensions D.
         bias: Whether to add a learned bias to the scalars, 0 at first; vectors have none.
-        message: "absolute", "difference" or "sum", as in `continuous_conv`.
+        message: "absolute", "difference", "sum", "mixed" or "opposite": a name in `MESSAGES`.
         generator: Source of the initial weights (Xavier-uniform); None for torch's global one.
     """
 

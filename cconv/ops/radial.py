@@ -34,7 +34,12 @@ def applies(features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, ed
 
 
 def convolve(
-    features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, edges: Edges, weights: Tensor | None, own: float
+    features: Tensor,
+    scalar_filters: Tensor,
+    vector_filters: Tensor,
+    edges: Edges,
+    weights: Tensor | None,
+    own: tuple[float, float],
 ) -> Tensor:
     """Radial convolution without bias; equations in `cconv.nn.radial_conv`.
 
@@ -44,7 +49,7 @@ def convolve(
         vector_filters: (B, S + 2V, V_out).
         edges: Pairs of receivers and senders.
         weights: Weight of each edge (E,), None for 1.
-        own: Message of an edge = sender's features + ``own`` times the receiver's.
+        own: Message of an edge = sender's features + ``own`` times the receiver's; one for scalars, one for vectors.
 
     Returns:
         Scalars, then components of vectors, (N, S_out + V_out · D).
@@ -56,7 +61,7 @@ def convolve(
     arrays = [tensor.detach().numpy() for tensor in tensors]
     weighted = None if weights is None else weights.detach().numpy()
     number = values.dtype.type
-    arguments = (*arrays, weighted, number(edges.cutoff), values, number(own), *filters, output)
+    arguments = (*arrays, weighted, number(edges.cutoff), values, *map(number, own), *filters, output)
     workers = _num_workers(len(edges) * sum(each[..., 0].size for each in filters))
     bounds = [edges.num_receivers * worker // workers for worker in range(workers + 1)]
     run_on_workers(lambda worker: _convolve_rows(bounds[worker], bounds[worker + 1], *arguments), workers)
@@ -75,15 +80,15 @@ def _num_workers(reads: int) -> int:
 
 @_compile
 def _convolve_rows(
-    first, last, splits, receivers, senders, displacements, distances, weights, cutoff, features, own,
-    scalar_filters, vector_filters, output,
+    first, last, splits, receivers, senders, displacements, distances, weights, cutoff, features, own_scalars,
+    own_vectors, scalar_filters, vector_filters, output,
 ):  # fmt: skip
     """Add the convolution at the receivers from `first` up to `last` to their rows of `output`."""
     dim, vectors = displacements.shape[1], vector_filters.shape[1] - scalar_filters.shape[1]
     scalars = scalar_filters.shape[1] - vectors
     lower, shares = np.empty(EDGES_AT_A_TIME, np.int32), np.empty((2, EDGES_AT_A_TIME), features.dtype)
     directions = np.empty((dim, EDGES_AT_A_TIME), features.dtype)
-    messages = np.empty((scalars + vectors + vectors * dim, EDGES_AT_A_TIME), features.dtype)
+    messages = np.empty((scalars + vectors + vectors * dim, EDGES_AT_A_TIME), features.dtype)  # projections between
     terms = np.empty((output.shape[1], EDGES_AT_A_TIME), features.dtype)
     row = first
     for start in range(splits[first], splits[last], EDGES_AT_A_TIME):
@@ -93,7 +98,9 @@ def _convolve_rows(
         if weights is not None:
             _scale(weights[start:end], shares)
         _point(displacements[start:end], distances[start:end], directions)
-        _gather(receivers[start:end], senders[start:end], features, own, scalars, vectors, messages)
+        pairs = receivers[start:end], senders[start:end]
+        _gather(*pairs, features[:, :scalars], own_scalars, messages)
+        _gather(*pairs, features[:, scalars:], own_vectors, messages[scalars + vectors :])
         _project(directions, count, scalars, vectors, messages)
         _set_scalars(messages, scalar_filters, lower, shares, count, terms)
         _set_vectors(messages, directions, vector_filters, lower, shares, count, scalars, terms[len(scalar_filters) :])
@@ -130,10 +137,10 @@ def _point(displacements, distances, directions):
 
 
 @_compile
-def _gather(receivers, senders, features, own, scalars, vectors, messages):
-    """Set the messages (S + V + V · D, E): scalars, room for projections, components of vectors."""
+def _gather(receivers, senders, features, own, messages):
+    """Set a message of each edge (C, E) for features (M, C)."""
     for c in range(features.shape[1]):
-        row = messages[c if c < scalars else c + vectors]
+        row = messages[c]
         if own:
             for k in range(uintp(len(senders))):
                 row[k] = features[uintp(senders[k]), c] + own * features[uintp(receivers[k]), c]

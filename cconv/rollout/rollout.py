@@ -1,26 +1,93 @@
 """The rollout: every answer of a model leads to the frame that the next one is asked about."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
-from cconv.rollout.integrators import Integrator
+from cconv.errors import CConvError
+from cconv.tasks.integrators import Integrator
+from cconv.tasks.task import as_step
+
+FARTHEST_STEP = 10.0  # particle spacings in a frame; a particle that goes farther has left every flow behind
+MOST_IN_A_CELL = 10  # particles in a cube of two spacings, as a multiple of those of the undisturbed fluid, 2^D
 
 
-def rollout(
+class StepModel(Protocol):
+    """A model that answers for a window."""
+
+    task: Any
+
+    def predict_frame(self, frame: Window, scene: Scene) -> Tensor:
+        """Answer (M, D) for each of the M fluid particles at the end of a window."""
+
+
+class Diverged(CConvError):
+    """A rollout that cannot go on: positions are not finite, leap, or clump so that a step would have no bound.
+
+    Args:
+        frame: Index of the frame that was to be reached.
+        reason: What happened, as the end of a sentence.
+    """
+
+    def __init__(self, frame: int, reason: str):
+        super().__init__(f"the rollout diverged at frame {frame}: {reason}.")
+        self.frame, self.reason = frame, reason
+
+
+def rollout(model: StepModel, start: Window, scene: Scene) -> Iterator[Window]:
+    """Windows after a start, a frame later each, for as long as they are asked for.
+
+    Args:
+        model: Model of a step task, e.g. of `cconv.load_model`.
+        start: The window to begin with, at least as long as the model's history.
+        scene: Its scene.
+
+    Raises:
+        ConfigError: If the model predicts a field.
+        Diverged: If the next frame would not be a state of particles any more.
+    """
+    return advance(model.predict_frame, as_step(model.task).integrator, start, scene)
+
+
+def advance(
     predict: Callable[[Window, Scene], Tensor], integrator: Integrator, start: Window, scene: Scene
 ) -> Iterator[Window]:
-    """Windows after a start, a frame later each, for as long as they are asked for.
+    """Windows after a start by any function that answers; `rollout` with the function of a model.
 
     Args:
         predict: Window and scene to the answer (M, D) for each of the M fluid particles.
         integrator: What turns an answer into the next frame.
         start: The window to begin with; its future is not looked at, unless `predict` does.
         scene: Its scene.
+
+    Raises:
+        Diverged: If the next frame would not be a state of particles any more.
     """
-    window = start
+    window = replace(start, positions=start.positions.double())
     while True:
         window = integrator.advance(window, predict(window, scene), scene)
+        check_state(window, scene)
         yield window
+
+
+def check_state(window: Window, scene: Scene) -> None:
+    """Check that the present frame can be asked about: finite, without leaps, with a bounded number of neighbours.
+
+    Raises:
+        Diverged: With the reason.
+    """
+    present, spacing = window.present, scene.particle_spacing
+    if not torch.isfinite(present).all():
+        raise Diverged(window.frame, "positions are not finite")
+    farthest = float(window.last_displacements(scene.box).norm(dim=1).max()) / spacing
+    if farthest > FARTHEST_STEP:
+        raise Diverged(window.frame, f"a particle moved {farthest:.3g} spacings in a frame")
+    cells = torch.floor(present.double() / (2 * spacing)).long()
+    fullest = int(cells.unique(dim=0, return_counts=True)[1].max())
+    if fullest > MOST_IN_A_CELL * 2**scene.dim:
+        raise Diverged(window.frame, f"{fullest} particles clumped within two spacings")

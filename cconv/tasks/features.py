@@ -4,15 +4,17 @@ Networks know no metres, kilograms or seconds: lengths are in particle spacings,
 intervals of stored frames. So a network holds at every resolution and in all units.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
+from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.errors import ShapeError
 from cconv.neighbors import Edges, radius_graph
@@ -20,7 +22,8 @@ from cconv.nn.kinds import Kinds, join_kinds
 from cconv.sph.kernels import AbstractKernel
 from cconv.sph.operators import density
 
-CONSTANT, DENSITY, VELOCITY, NORMAL = "one", "density", "velocity", "normal"  # names of features
+CONSTANT, DENSITY, PARTICLE_TYPE, NORMAL = "one", "density", "particle_type", "normal"  # names of features
+ACCELERATIONS, FORCE, VELOCITY = "accelerations", "force", "velocity"
 WALLS = "walls"  # stands among the features of a task for those of the wall points
 
 
@@ -43,6 +46,11 @@ class Units:
         """Spacings in a frame's time."""
         return self.length / self.time
 
+    @property
+    def acceleration(self) -> float:
+        """Spacings in a frame's time, squared."""
+        return self.length / self.time**2
+
 
 def units_of(masses: Float[Tensor, " N"], scene: Scene) -> Units:
     """Units of a frame whose fluid particles have masses (N,)."""
@@ -60,7 +68,7 @@ class Features:
         scalars: (N, S).
         vectors: (N, V, D).
         scalar_names: Names of the scalars, S.
-        vector_names: Names of the vectors, V.
+        vector_names: Names of the vectors, V; those of one feature, e.g. of a history, share its name.
     """
 
     scalars: Float[Tensor, "N S"]
@@ -115,22 +123,24 @@ class Features:
         return replace(self, scalars=self.scalars.to(dtype), vectors=self.vectors.to(dtype))
 
 
-def kinds_of(names: Sequence[str]) -> Kinds:
-    """How many of some features are scalars and how many vectors."""
-    return Kinds(sum(name in _SCALARS for name in names), sum(name in _VECTORS for name in names))
+def kinds_of(names: Sequence[str], history: int = 1) -> Kinds:
+    """How many of some features are scalars and how many vectors, in windows of some frames."""
+    vectors = (history - 2 if name == ACCELERATIONS else 1 for name in names if name in _VECTORS)
+    return Kinds(sum(name in _SCALARS for name in names), sum(vectors))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """The fluid particles of a frame as a network sees them, in `units`.
+    """The particles of a frame as a network sees them, in `units`.
 
     Attributes:
-        positions: Fluid positions (N, D), particle spacings.
-        features: Features of each fluid particle; the first scalar is a constant.
+        positions: (N, D), particle spacings.
+        features: Features of each particle; the first scalar is a constant.
         wall_positions: (B, D), particle spacings, or None where the scene has no walls.
         wall_features: Normals, or a constant where the data hold none; None without walls.
         box: Bounds and periodic axes, particle spacings.
         units: What these numbers are multiples of.
+        answered: Which particles the network has to answer for, (N,), bool: the fluid; None for all.
     """
 
     positions: Float[Tensor, "N D"]
@@ -139,11 +149,17 @@ class Inputs:
     wall_features: Features | None
     box: Box
     units: Units
+    answered: Bool[Tensor, " N"] | None = None
 
     @property
     def num_particles(self) -> int:
-        """Number of fluid particles N."""
+        """Number of particles N."""
         return len(self.positions)
+
+    @property
+    def num_answers(self) -> int:
+        """Number of particles that the network has to answer for, M."""
+        return self.num_particles if self.answered is None else int(self.answered.sum())
 
     @property
     def dim(self) -> int:
@@ -184,6 +200,11 @@ class FluidState:
     box: Box | None
     kernel: AbstractKernel
 
+    @property
+    def fluid_masses(self) -> Float[Tensor, " M"]:
+        """Masses of the fluid particles (M,)."""
+        return self.masses
+
     @cached_property
     def edges(self) -> Edges:
         """Pairs within the kernel's support."""
@@ -191,7 +212,7 @@ class FluidState:
 
     @cached_property
     def densities(self) -> Float[Tensor, " N"]:
-        """Density by summation over fluid particles only (D1), as in the thesis, (N,)."""
+        """Density by summation over these particles only (D1), as in the thesis, (N,)."""
         return density(self.masses, self.edges, self.kernel)
 
     def knowing(self, edges: Edges, densities: Float[Tensor, " N"]) -> "FluidState":
@@ -210,27 +231,73 @@ def fluid_state(frame: Frame, box: Box, kernel: AbstractKernel) -> FluidState:
     return FluidState(positions=positions, velocities=velocities, masses=masses, box=box, kernel=kernel)
 
 
-_SCALARS = {
+@dataclass(frozen=True, kw_only=True)
+class WindowState(FluidState):
+    """Particles of all types at the end of a window, in float64; velocities are backward differences.
+
+    Attributes:
+        accelerations: Second differences of the positions ÷ Δt², newest first, (N, H - 2, D).
+        is_fluid: Which particles are fluid, (N,), bool.
+        force: Constant external acceleration (D,), 0 where there is none.
+    """
+
+    accelerations: Float[Tensor, "N K D"]
+    is_fluid: Bool[Tensor, " N"]
+    force: Float[Tensor, " D"]
+
+    @property
+    def fluid_masses(self) -> Float[Tensor, " M"]:
+        """Masses of the fluid particles (M,)."""
+        return self.masses[self.is_fluid]
+
+
+def window_state(window: Window, history: int, scene: Scene, kernel: AbstractKernel) -> WindowState:
+    """Particles at the end of a window, and what its last `history` frames say of their motion.
+
+    Raises:
+        ShapeError: If the window has fewer frames.
+    """
+    velocities = window.displacements(scene.box, history) / scene.frame_dt
+    force = torch.zeros(scene.dim) if scene.force is None else torch.tensor(scene.force)
+    return WindowState(
+        positions=window.present.double(),
+        velocities=velocities[-1],
+        masses=window.masses.double(),
+        box=scene.box,
+        kernel=kernel,
+        accelerations=(velocities.diff(dim=0) / scene.frame_dt).flip(0).transpose(0, 1),
+        is_fluid=window.is_fluid,
+        force=force.double(),
+    )
+
+
+# The velocity is the last of the vectors: networks that know it only as differences leave out the last.
+_SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
     CONSTANT: lambda state, units: torch.ones_like(state.masses),
     DENSITY: lambda state, units: state.densities / units.density,
+    PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
 }
-_VECTORS = {VELOCITY: lambda state, units: state.velocities / units.velocity}
+_VECTORS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N, V, D) of a state
+    ACCELERATIONS: lambda state, units: state.accelerations / units.acceleration,
+    FORCE: lambda state, units: (state.force / units.acceleration).expand_as(state.velocities)[:, None],
+    VELOCITY: lambda state, units: state.velocities[:, None] / units.velocity,
+}
 
 
 def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, names: Collection[str]) -> Inputs:
-    """Network inputs in float32: features of the fluid particles by name (thesis section 3.1), normals of the walls.
+    """Network inputs in float32: features of the particles by name (thesis section 3.1), normals of the walls.
 
     Args:
-        state: Fluid particles.
+        state: Particles.
         boundary: Wall points, or None.
         scene: Scene of the frame.
-        names: Features of the fluid particles; no sum over neighbours is taken for those that are not named.
+        names: Features of the particles; no sum over neighbours is taken for those that are not named.
     """
-    units = units_of(state.masses, scene)
+    units = units_of(state.fluid_masses, scene)
     lower, upper = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
     return Inputs(
         positions=(state.positions / units.length).float(),
-        features=_fluid_features(state, units, names),
+        features=_particle_features(state, units, names),
         wall_positions=None if boundary is None else (boundary.positions.double() / units.length).float(),
         wall_features=None if boundary is None else _wall_features(boundary),
         box=Box(lower, upper, scene.box.periodic),
@@ -238,14 +305,14 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
     )
 
 
-def _fluid_features(state: FluidState, units: Units, names: Collection[str]) -> Features:
+def _particle_features(state: FluidState, units: Units, names: Collection[str]) -> Features:
     scalars = {name: feature(state, units) for name, feature in _SCALARS.items() if name in names}
     vectors = {name: feature(state, units) for name, feature in _VECTORS.items() if name in names}
     return Features(
         scalars=torch.stack([*scalars.values()], dim=1).float(),
-        vectors=torch.stack([*vectors.values()], dim=1).float(),
+        vectors=torch.cat([*vectors.values()], dim=1).float(),
         scalar_names=tuple(scalars),
-        vector_names=tuple(vectors),
+        vector_names=tuple(name for name, values in vectors.items() for _ in range(values.shape[1])),
     )
 
 

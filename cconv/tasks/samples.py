@@ -1,16 +1,23 @@
 """Samples: frames with what a network is given and what it has to answer."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
 from cconv.data.trajectory import Frame, Scene
+from cconv.data.window import Window, windows
 from cconv.errors import check_choice
 from cconv.tasks.features import Inputs, make_inputs
-from cconv.tasks.task import FieldTask
+from cconv.tasks.task import FieldTask, StepTask, Task, as_field
+
+MOST_SPREAD = 100
+HORIZON = 20  # frames of the rollouts that models are compared by, unless another number is asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,15 +28,30 @@ class Sample:
         trajectory: Name of its trajectory.
         frame: Index of the frame in the stored trajectory.
         inputs: What the network is given.
-        target: Analytic field (N, C) at the fluid particles, float32, in `target_unit`, as networks predict it.
+        target: Answer (M, C) for the fluid particles, float32, in `target_unit`, as networks predict it.
         target_unit: What it is a multiple of, in the units of the data.
     """
 
     trajectory: str
     frame: int
     inputs: Inputs
-    target: Float[Tensor, "N C"]
+    target: Float[Tensor, "M C"]
     target_unit: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepSample(Sample):
+    """One window to learn a step from, or to begin a rollout with.
+
+    Attributes:
+        window: Its frames, and those that follow as far as they are known.
+        scene: Scene of the window.
+        task: What is asked.
+    """
+
+    window: Window
+    scene: Scene
+    task: StepTask
 
 
 def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "", index: int = 0) -> Sample:
@@ -47,6 +69,86 @@ def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "
     unit = task.unit(inputs.units)
     target = (task.field(state) / unit).float()
     return Sample(trajectory=trajectory, frame=index, inputs=inputs, target=target, target_unit=unit)
+
+
+def make_step_sample(window: Window, scene: Scene, task: StepTask) -> StepSample:
+    """Inputs with all features of a task, and the answer that leads to the first frame of the window's future."""
+    inputs = task.inputs(window, scene, task.features)
+    unit = task.unit(inputs.units)
+    return StepSample(
+        trajectory=window.trajectory,
+        frame=window.frame,
+        inputs=inputs,
+        target=(task.target(window, scene) / unit).float(),
+        target_unit=unit,
+        window=window,
+        scene=scene,
+        task=task,
+    )
+
+
+class WindowSamples(Sequence[StepSample]):
+    """Samples of windows, each made when it is asked for, because windows share their frames and samples do not.
+
+    Args:
+        windows: Windows with at least one frame of future.
+        scene: Their scene.
+        task: What is asked.
+    """
+
+    def __init__(self, windows: Sequence[Window], scene: Scene, task: StepTask):
+        self.windows, self.scene, self.task = windows, scene, task
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return WindowSamples(self.windows[index], self.scene, self.task)
+        return make_step_sample(self.windows[index], self.scene, self.task)
+
+    @cached_property
+    def spread(self) -> list[StepSample]:
+        """Samples of at most `MOST_SPREAD` windows, evenly spread, whose statistics stand for those of all."""
+        return list(self[:: math.ceil(len(self) / MOST_SPREAD)])
+
+
+def window_samples(dataset: Dataset, split: str, task: StepTask, future: int, stride: int) -> WindowSamples:
+    """Samples of the windows of a split, in order.
+
+    Args:
+        dataset: Data set.
+        split: "train", "valid" or "test".
+        task: What is asked.
+        future: Frames after each window that are known.
+        stride: Frames from one window to the next.
+
+    Raises:
+        DataError: If a trajectory is too short for a single window.
+    """
+    check_choice("split", split, dataset.splits)
+    found = [
+        window
+        for trajectory in dataset.trajectories(split)
+        for window in windows(trajectory, task.history, future, stride)
+    ]
+    return WindowSamples(found, dataset.scene, task)
+
+
+def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HORIZON) -> Iterable[Sample]:
+    """Samples of a split that models are compared by: all frames of a field, or windows that rollouts begin with.
+
+    Windows do not overlap, as in LagrangeBench.
+
+    Args:
+        dataset: Data set.
+        split: "train", "valid" or "test".
+        task: What is asked.
+        horizon: Frames of each rollout of a step task.
+    """
+    if isinstance(task, StepTask):
+        return window_samples(dataset, split, task, horizon, stride=task.history + horizon)
+    return iterate_samples(dataset, split, as_field(task))
 
 
 def iterate_samples(dataset: Dataset, split: str, task: FieldTask) -> Iterator[Sample]:

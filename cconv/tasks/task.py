@@ -2,56 +2,70 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
+from cconv.data.window import Window
 from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
-from cconv.tasks.features import CONSTANT, DENSITY, VELOCITY, WALLS, FluidState, Inputs, Units, fluid_state, make_inputs
+from cconv.tasks.features import (
+    CONSTANT,
+    DENSITY,
+    VELOCITY,
+    WALLS,
+    FluidState,
+    Inputs,
+    Units,
+    fluid_state,
+    kinds_of,
+    make_inputs,
+    window_state,
+)
+from cconv.tasks.integrators import Integrator
 
 
 @dataclass(frozen=True)
-class FieldTask(ABC):
-    """A field that analytic SPH gives as a function of the present frame.
+class Task(ABC):
+    """What is asked of a network.
 
     Attributes:
-        kernel: Field name of the SPH kernel of densities and field.
+        kernel: Field name of the SPH kernel of densities and fields.
         relative_smoothing_length: Its h in particle spacings.
+        history: Frames that an answer depends on, the present one among them.
     """
 
     name: ClassVar[str]
-    symbol: ClassVar[str]  # of the field, for charts
-    meaning: ClassVar[str]  # of the field, a sentence for readers
-    objective: ClassVar[str] = "normalized_mse"  # what models are compared by, of `cconv.evaluation.objectives`
+    meaning: ClassVar[str]  # of the answer, a sentence for readers
+    objective: ClassVar[str]  # what models are compared by, of `cconv.evaluation.objectives`
     output: ClassVar[Kinds]
-    features: ClassVar[tuple[str, ...]] = (CONSTANT, DENSITY, VELOCITY, WALLS)
-    optional: ClassVar[tuple[str, ...]] = (WALLS, DENSITY)  # which models may do without
+    features: ClassVar[tuple[str, ...]]
+    optional: ClassVar[tuple[str, ...]]  # which models may do without
     checks: ClassVar[tuple[str, ...]]  # of stability, that models must pass: names in `cconv.evaluation.checks`
+    histories: ClassVar[tuple[int, int]] = (1, 1)  # the shortest and the longest
 
     kernel: str = "cubic_spline"
     relative_smoothing_length: float = 1.0
-
-    @abstractmethod
-    def field(self, state: FluidState) -> Float[Tensor, "N C"]:
-        """Analytic field (N, C) at the fluid particles, in the units of the data."""
+    history: int = 1
 
     @abstractmethod
     def unit(self, units: Units) -> float:
         """What networks predict multiples of, in the units of the data."""
 
     @abstractmethod
-    def magnitude(self, density: float, speed: float, length: float) -> float:
-        """Size of the field where the density differs by so much over a length, in a flow of some speed."""
+    def inputs(self, observed: Any, scene: Scene, names: Collection[str]) -> Inputs:
+        """What a network that takes some features is given.
 
-    @abstractmethod
-    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
-        """The field as a user computes it who wants it fast, from particles in float32; timed beside the networks."""
+        Args:
+            observed: A frame for a field, a window for a step.
+            scene: Its scene.
+            names: Features of the task.
+        """
 
     @classmethod
     def check_features(cls, names: Collection[str]) -> None:
@@ -73,14 +87,105 @@ class FieldTask(ABC):
         if len(set(names)) < len(names):
             raise ConfigError("`features` must hold each name once")
 
+    @classmethod
+    def check_history(cls, history: int) -> None:
+        """Check that an answer can depend on so many frames.
+
+        Raises:
+            ConfigError: If there are too few or too many.
+        """
+        shortest, longest = cls.histories
+        if not shortest <= history <= longest:
+            allowed = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
+            raise ConfigError(f"`history` must be {allowed} for the task {cls.name!r}, got {history}")
+
+    def kinds(self, names: Collection[str]) -> Kinds:
+        """How many of the features with these names are scalars and how many vectors."""
+        return kinds_of(tuple(names), self.history)
+
     def kernel_at(self, particle_spacing: float, dim: int) -> AbstractKernel:
         """SPH kernel in data of some particle spacing."""
         return kernel_named(self.kernel)(self.relative_smoothing_length * particle_spacing, dim)
+
+
+@dataclass(frozen=True)
+class FieldTask(Task):
+    """A field that analytic SPH gives as a function of the present frame."""
+
+    symbol: ClassVar[str]  # of the field, for charts
+    objective = "normalized_mse"
+    features = (CONSTANT, DENSITY, VELOCITY, WALLS)
+    optional = (WALLS, DENSITY)
+
+    @abstractmethod
+    def field(self, state: FluidState) -> Float[Tensor, "N C"]:
+        """Analytic field (N, C) at the fluid particles, in the units of the data."""
+
+    @abstractmethod
+    def magnitude(self, density: float, speed: float, length: float) -> float:
+        """Size of the field where the density differs by so much over a length, in a flow of some speed."""
+
+    @abstractmethod
+    def compiled_field(self, sums: CompiledSums, state: FluidState) -> Tensor:
+        """The field as a user computes it who wants it fast, from particles in float32; timed beside the networks."""
 
     def state(self, frame: Frame, scene: Scene) -> FluidState:
         """Fluid particles of a frame as the analytic field needs them."""
         return fluid_state(frame, scene.box, self.kernel_at(scene.particle_spacing, scene.dim))
 
-    def inputs(self, frame: Frame, scene: Scene, names: Collection[str]) -> Inputs:
+    def inputs(self, observed: Frame, scene: Scene, names: Collection[str]) -> Inputs:
         """What a network that takes some features is given of a frame."""
-        return make_inputs(self.state(frame, scene), frame.boundary, scene, names)
+        return make_inputs(self.state(observed, scene), observed.boundary, scene, names)
+
+
+@dataclass(frozen=True)
+class StepTask(Task):
+    """The step to the next stored frame, from a window of frames up to the present one.
+
+    Attributes:
+        integrator: Turns answers into the next frame, and the next frame into the answer that leads to it.
+    """
+
+    integrator: ClassVar[Integrator]
+    objective = "rollout_mse"
+    checks = ()
+    histories = (2, 20)
+
+    history: int = 6
+
+    def target(self, window: Window, scene: Scene) -> Float[Tensor, "M C"]:
+        """Answer (M, C) that leads the fluid to the first frame of the window's future, in the units of the data."""
+        return self.integrator.target(window, scene)
+
+    def inputs(self, observed: Window, scene: Scene, names: Collection[str]) -> Inputs:
+        """What a network that takes some features is given of a window.
+
+        Wall particles are particles like others, which send and receive, but no answer is asked for them. Boundary
+        points count only where there are none.
+        """
+        kernel = self.kernel_at(scene.particle_spacing, scene.dim)
+        state = window_state(observed, self.history, scene, kernel)
+        boundary = observed.boundary if bool(observed.is_fluid.all()) else None
+        return replace(make_inputs(state, boundary, scene, names), answered=observed.is_fluid)
+
+
+def as_field(task: Task) -> FieldTask:
+    """The task, if it is a field of the present frame.
+
+    Raises:
+        ConfigError: If it is a step.
+    """
+    if not isinstance(task, FieldTask):
+        raise ConfigError(f"the task {task.name!r} is a step, and only fields are possible here, e.g. 'density_rate'.")
+    return task
+
+
+def as_step(task: Task) -> StepTask:
+    """The task, if it is the step to the next frame.
+
+    Raises:
+        ConfigError: If it is a field.
+    """
+    if not isinstance(task, StepTask):
+        raise ConfigError(f"the task {task.name!r} is a field, and only steps are possible here, e.g. 'acceleration'.")
+    return task

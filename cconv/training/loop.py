@@ -1,4 +1,4 @@
-"""The training loop: Adam on the mean squared error of standardised targets."""
+"""The training loop: Adam on the weighted mean squared error of standardised targets."""
 
 import math
 import time
@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from itertools import islice
 
 import torch
-import torch.nn.functional as F
 
 from cconv.errors import check_choice
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
 from cconv.training.batches import batches
+from cconv.training.examples import Examples
 from cconv.training.geometry_cache import GeometryCache
+from cconv.training.losses import LOSSES, loss_of
 from cconv.training.progress import Progress, begin
 
 SCHEDULES = {
@@ -33,6 +34,7 @@ class Optimization:
         batch_size: Frames of an update.
         learning_rate: Initial learning rate of Adam.
         schedule: "constant", "cosine" or "exponential"; the last two fall to 1 % of the initial rate.
+        loss: Name in `LOSSES`.
     """
 
     updates: int
@@ -40,6 +42,7 @@ class Optimization:
     batch_size: int = 1
     learning_rate: float = 1e-3
     schedule: str = "cosine"
+    loss: str = "mse"
 
     def rate_at(self, update: int) -> float:
         """Return the learning rate of an update, counted from 1."""
@@ -56,7 +59,7 @@ class TrainingState:
 
     Attributes:
         updates: Gradient updates done.
-        train_loss: Mean squared error of standardised targets in this update's batch.
+        train_loss: Loss of this update's batch.
         learning_rate: Learning rate of this update.
         valid_error: Validation error if an evaluation followed this update, else None.
         seconds: Time since training began, evaluations included.
@@ -73,7 +76,7 @@ class TrainingState:
 
 def train(
     model: Model,
-    samples: Sequence[Sample],
+    examples: Examples,
     valid_error: Callable[[Model, GeometryCache], float],
     optimization: Optimization,
     *,
@@ -85,7 +88,7 @@ def train(
 
     Args:
         model: Model to train.
-        samples: Frames to learn from.
+        examples: Frames to learn from.
         valid_error: Function from a cache of geometries to the validation error of the model.
         optimization: Budget and optimiser.
         data_seed: Seed of the batch order.
@@ -94,18 +97,20 @@ def train(
             been interrupted; it is updated in place. None begins a new training.
 
     Raises:
-        ConfigError: If the schedule is unknown.
+        ConfigError: If the schedule or the loss is unknown.
     """
     check_choice("schedule", optimization.schedule, SCHEDULES)
+    check_choice("loss", optimization.loss, LOSSES)
     progress = progress or begin(model)
     start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
-    order = batches(len(samples), optimization.batch_size, data_seed)
+    order = batches(len(examples), optimization.batch_size, data_seed)
     order = islice(order, progress.updates, optimization.updates)
     for update, indices in enumerate(order, start=progress.updates + 1):
         rate = optimization.rate_at(update)
         progress.optimizer.param_groups[0]["lr"] = rate
-        loss = _update(model, [samples[index] for index in indices], progress.optimizer, geometry)
+        batch = [examples.draw(index, update) for index in indices]
+        loss = _update(model, batch, progress.optimizer, geometry, optimization.loss)
         valid = None
         if math.isfinite(loss) and optimization.is_evaluated(update):
             valid = valid_error(model, geometry)
@@ -123,13 +128,16 @@ def train(
             return
 
 
-def _update(model: Model, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache) -> float:
+def _update(
+    model: Model, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache, loss_name: str
+) -> float:
     """Take one step on the mean loss of a batch, frame by frame, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     total = 0.0
     for sample in batch:
         prediction = model(sample.inputs, geometry(sample))
-        loss = F.mse_loss(prediction, model.standardize_target(sample.target)) / len(batch)
+        target = model.standardize_target(sample.target)
+        loss = loss_of(prediction, target, LOSSES[loss_name]) / len(batch)
         loss.backward()
         total += loss.item()
     if math.isfinite(total):

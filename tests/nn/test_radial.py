@@ -38,12 +38,14 @@ def dense_radial_conv(layer, features, positions, senders_at, features_at_receiv
     hats = (1 - ((distances / CUTOFF * (terms - 1))[..., None] - torch.arange(terms)).abs()).clamp_min(0)
     hats = hats * ((distances > 0) & (distances <= CUTOFF))[..., None]
     directions = apart / torch.where(distances > 0, distances, 1.0)[..., None]
-    own = {"absolute": 0, "difference": -1, "sum": 1}[layer.message]
-    values = features[None].expand(len(positions), -1, -1)
-    if own:
-        values = values + own * features_at_receivers[:, None]
-    scalars = values[..., : layer.in_channels[0]]
-    vectors = values[..., layer.in_channels[0] :].reshape(*values.shape[:2], -1, dim)
+    of_scalars, of_vectors = {
+        "absolute": (0, 0), "difference": (-1, -1), "sum": (1, 1), "mixed": (0, -1), "opposite": (1, -1)
+    }[layer.message]  # fmt: skip
+    sent = features[None].expand(len(positions), -1, -1)
+    received = torch.zeros_like(sent) if features_at_receivers is None else features_at_receivers[:, None]
+    count = layer.in_channels[0]
+    scalars = (sent + of_scalars * received)[..., :count]
+    vectors = (sent + of_vectors * received)[..., count:].reshape(*sent.shape[:2], -1, dim)
     along = (vectors * directions[:, :, None]).sum(-1)
     to_scalars = torch.cat([scalars, along], -1)
     to_vectors = torch.cat(
@@ -60,7 +62,7 @@ def dense_radial_conv(layer, features, positions, senders_at, features_at_receiv
     )
 
 
-@pytest.mark.parametrize("message", ["absolute", "difference", "sum"])
+@pytest.mark.parametrize("message", ["absolute", "difference", "sum", "mixed", "opposite"])
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_agrees_with_the_sum_over_all_pairs(dim, message, generator):
     positions = torch.rand(30, dim, generator=generator, dtype=torch.float64)

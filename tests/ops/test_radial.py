@@ -32,7 +32,7 @@ def both_ways(layer, features, geometry):
     return found, layer._convolve_generally(features, geometry)
 
 
-@pytest.mark.parametrize("message", ["absolute", "difference", "sum"])
+@pytest.mark.parametrize("message", ["absolute", "difference", "sum", "mixed", "opposite"])
 @pytest.mark.parametrize("channels", CHANNELS)
 def test_agrees_with_the_general_path(channels, message, generator):
     for dim, window in itertools.product((1, 2, 3), ("none", "poly6")):

@@ -6,6 +6,7 @@ from systems import configured, problem
 
 from cconv.errors import ConfigError
 from cconv.models.errors import frame_errors, normalized_mse
+from cconv.training.examples import StoredExamples
 from cconv.training.loop import SCHEDULES, Optimization, train
 
 LINEAR = configured(layers=1, kernel_size=4, relative_cutoff=2.0, message="difference", mapping="identity")
@@ -14,7 +15,9 @@ LINEAR = configured(layers=1, kernel_size=4, relative_cutoff=2.0, message="diffe
 def run(given, network=LINEAR, seed=0, cache_bytes=2**30, **options):
     model = given.build_model(network, seed)
     asked = Optimization(**{"updates": 6, "evaluate_every": 3, "learning_rate": 0.05} | options)
-    return model, list(train(model, given.train_samples, given.valid_error, asked, cache_bytes=cache_bytes))
+    return model, list(
+        train(model, StoredExamples(given.train_samples), given.valid_error, asked, cache_bytes=cache_bytes)
+    )
 
 
 def test_training_learns_the_density_rate(generator):
@@ -58,7 +61,9 @@ def test_a_loss_that_is_not_finite_ends_training_and_leaves_the_weights(generato
     model = given.build_model(LINEAR, 0)
     model.target_mean.fill_(math.nan)
     before = model.network.convs[0].filters.clone()
-    states = list(train(model, given.train_samples, given.valid_error, Optimization(updates=5, evaluate_every=1)))
+    states = list(
+        train(model, StoredExamples(given.train_samples), given.valid_error, Optimization(updates=5, evaluate_every=1))
+    )
     assert len(states) == 1
     assert states[0].diverged
     assert torch.equal(model.network.convs[0].filters, before)

@@ -8,6 +8,7 @@ from safetensors.torch import save_file
 from systems import configured, problem
 
 from cconv.errors import DataError
+from cconv.training.examples import StoredExamples
 from cconv.training.loop import Optimization, train
 from cconv.training.progress import begin, load_progress, save_progress
 
@@ -30,17 +31,17 @@ def one_thread():
 def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, network, left_at):
     given = problem(generator)
     whole = given.build_model(network, 0)
-    losses = [state.train_loss for state in train(whole, given.train_samples, given.valid_error, ASKED)]
+    losses = [state.train_loss for state in train(whole, StoredExamples(given.train_samples), given.valid_error, ASKED)]
     first = given.build_model(network, 0)
     progress = begin(first)
-    states = train(first, given.train_samples, given.valid_error, ASKED, progress=progress)
+    states = train(first, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=progress)
     for state in states:
         if state.updates == left_at:
             break
     save_progress(tmp_path / "progress", first, progress)
     second = given.build_model(network, 1)
     restored = load_progress(tmp_path / "progress", second)
-    rest = list(train(second, given.train_samples, given.valid_error, ASKED, progress=restored))
+    rest = list(train(second, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=restored))
     assert [state.train_loss for state in rest] == losses[left_at:]
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(second.parameters(), whole.parameters(), strict=True))
 
@@ -52,7 +53,7 @@ def test_a_restored_training_counts_its_seconds_from_where_it_was(generator, mon
     model = given.build_model(NETWORKS[0], 0)
     progress = begin(model)
     progress.seconds = 100
-    states = train(model, given.train_samples, given.valid_error, ASKED, progress=progress)
+    states = train(model, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=progress)
     assert [next(states).seconds for _ in range(3)] == [101, 102, 103]
 
 

@@ -12,6 +12,7 @@ from cconv.sph.kernels import KERNELS
 from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
+from cconv.tasks.task import StepTask
 from cconv.validation import Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
@@ -22,7 +23,7 @@ _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for nam
 HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
-    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule")),
+    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "noise")),
 )
 
 Settings = TypeVar("Settings", bound=StrictModel)
@@ -33,13 +34,16 @@ class TaskConfig(StrictModel):
     """What is asked of a network: the task, its SPH kernel, and the features that networks are given.
 
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
-    takes all features of the task.
+    takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
+    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
     """
 
     name: Annotated[str, OneOf(tuple(TASKS))]
     kernel: str = "cubic_spline"
     smoothing_length: Length | None = None
     features: tuple[str, ...] | None = Field(None, max_length=100)
+    history: Whole | None = None
+    horizon: Whole | None = Field(None, ge=1, le=100_000)
 
     @field_validator("kernel")
     @classmethod
@@ -61,6 +65,14 @@ class TaskConfig(StrictModel):
             TASKS[self.name].check_features({CONSTANT, *self.features})
         return self
 
+    @model_validator(mode="after")
+    def _frames_are_of_a_step(self) -> "TaskConfig":
+        if self.history is not None:
+            TASKS[self.name].check_history(self.history)
+        if self.horizon is not None and not issubclass(TASKS[self.name], StepTask):
+            raise ValueError(f"`horizon` is for steps, and {self.name!r} is a field of one frame; remove it")
+        return self
+
     @property
     def taken(self) -> tuple[str, ...]:
         """Features that networks are given."""
@@ -69,13 +81,19 @@ class TaskConfig(StrictModel):
 
 
 class TrainingConfig(StrictModel):
-    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache."""
+    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
+
+    `loss` says how much each frame counts. `noise`, for step tasks, is the standard deviation of the random walk that
+    is added to the velocities of a window, in particle spacings per frame.
+    """
 
     updates: Updates = 600
     evaluate_every: Updates = 50
     batch_size: Whole = Field(1, ge=1, le=10**6)
     learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
     schedule: Literal["constant", "cosine", "exponential"] = "cosine"
+    loss: Literal["mse", "balanced_mse"] = "mse"
+    noise: Real = Field(0.0, ge=0, le=1)
     cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
 
 

@@ -1,7 +1,7 @@
 """What all trials of a study share: the scene, the task and its samples."""
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -12,11 +12,13 @@ from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.model import Model, build_model
-from cconv.study.declared.configuration import Configuration, TaskConfig
+from cconv.study.declared.configuration import Configuration, TaskConfig, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
-from cconv.tasks.samples import Sample, iterate_samples
-from cconv.tasks.task import FieldTask
+from cconv.tasks.samples import HORIZON, Sample, WindowSamples, compared_samples, window_samples
+from cconv.tasks.task import StepTask, Task
+from cconv.training.augmentation import RandomWalkNoise
+from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
 from cconv.validation import PathText, check_setting, validated
 
 
@@ -32,9 +34,9 @@ class Problem:
     """
 
     scene: Scene
-    task: FieldTask
-    train_samples: list[Sample]
-    valid_samples: list[Sample]
+    task: Task
+    train_samples: Sequence[Sample]
+    valid_samples: Sequence[Sample]
 
     @property
     def objective(self) -> Objective:
@@ -45,6 +47,18 @@ class Problem:
         """Error of a model on the validation split, with geometries computed afresh unless a cache is given."""
         return self.objective.error(model, self.valid_samples, geometry)
 
+    def examples(self, training: TrainingConfig, seed: int) -> Examples:
+        """What a training learns from, with its noise.
+
+        Raises:
+            ConfigError: If noise is asked for where there is no window to add it to.
+        """
+        if not training.noise:
+            return StoredExamples(self.train_samples)
+        if not isinstance(self.train_samples, WindowSamples):
+            raise ConfigError(f"`training.noise` must be 0 for the field {self.task.name!r}, got {training.noise:g}.")
+        return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), seed)
+
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """A fresh model with the initial weights of `init_seed`."""
         return build_model(
@@ -52,7 +66,7 @@ class Problem:
             self.task,
             configuration.features,
             self.scene,
-            self.train_samples,
+            self.train_samples.spread if isinstance(self.train_samples, WindowSamples) else self.train_samples,
             torch.Generator().manual_seed(init_seed),
         )
 
@@ -89,14 +103,18 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
 
 
 def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[Sample]:
-    """Samples of a split for the study's task."""
-    return iterate_samples(dataset, split, study_task(study.task, dataset.scene))
+    """Samples of a split for the study's task: of the training split to learn from, of others to compare models by."""
+    task = study_task(study.task, dataset.scene)
+    if isinstance(task, StepTask) and split == "train":
+        return window_samples(dataset, split, task, future=1, stride=1)
+    return compared_samples(dataset, split, task, study.task.horizon or HORIZON)
 
 
-def study_task(task: TaskConfig, scene: Scene) -> FieldTask:
+def study_task(task: TaskConfig, scene: Scene) -> Task:
     """The task of a study in its scene."""
     length = task.smoothing_length
-    return task_named(task.name, task.kernel, 1.0 if length is None else length / scene.particle_spacing)
+    relative = 1.0 if length is None else length / scene.particle_spacing
+    return task_named(task.name, task.kernel, relative, task.history)
 
 
 def load_problem(
@@ -109,14 +127,13 @@ def load_problem(
         dataset: Its data.
         progress: Wraps an iterable to show progress, given a label.
     """
-    problem = Problem(
+    train, valid = (study_samples(study, dataset, split) for split in ("train", "valid"))
+    return Problem(
         scene=dataset.scene,
         task=study_task(study.task, dataset.scene),
-        train_samples=[],
-        valid_samples=[],
+        train_samples=train if isinstance(train, WindowSamples) else list(progress(train, "train")),
+        valid_samples=list(progress(valid, "valid")),
     )
-    samples = {split: list(progress(study_samples(study, dataset, split), split)) for split in ("train", "valid")}
-    return replace(problem, train_samples=samples["train"], valid_samples=samples["valid"])
 
 
 def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:

@@ -67,11 +67,11 @@ def run_trial(
     best = _best_so_far(folder)
     states = train(
         model,
-        problem.train_samples,
+        problem.examples(training, trial.data_seed),
         problem.valid_error,
-        Optimization(**training.model_dump(exclude={"cache_megabytes"})),
+        Optimization(**training.model_dump(exclude={"cache_megabytes", "noise"})),
         data_seed=trial.data_seed,
-        cache_bytes=training.cache_megabytes * 2**20,
+        cache_bytes=0 if training.noise else training.cache_megabytes * 2**20,  # noise moves the particles
         progress=progress,
     )
     try:

@@ -55,6 +55,7 @@ from cconv.study.stages.finalists import (
 )
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
+from cconv.tasks.task import as_field
 
 TIMED_FRAMES = 5
 GROWTH_REPEATS = 3
@@ -224,7 +225,7 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
         load_model,
         frames,
         session.dataset.scene,
-        task=problem.task,
+        task=as_field(problem.task),
         threads=settings.threads,
         repeats=settings.repeats,
     )
@@ -263,7 +264,7 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    material = make_material(trajectories, scene, problem.task, reach)
+    material = make_material(trajectories, scene, as_field(problem.task), reach)
     checks = make_checks(material)
     found = {
         finalist.id: Stability(**measure_stability(_predictors(finalist), checks, material))
@@ -334,7 +335,7 @@ def _task(session: Session) -> TaskFacts:
     task, objective = session.problem.task, session.problem.objective
     return TaskFacts(
         name=task.name,
-        symbol=task.symbol,
+        symbol=as_field(task).symbol,
         meaning=task.meaning,
         error=objective.label,
         error_meaning=objective.meaning,

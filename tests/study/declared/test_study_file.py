@@ -202,7 +202,10 @@ def test_what_is_no_regular_file_is_refused_without_reading_it(tmp_path):
     [
         ("task.kernel=cubic", r"`task\.kernel`: must be one of cubic_spline"),
         ("task.smoothing_length=1e300", r"`task\.smoothing_length`: input should be less than"),
-        ("task.name=density_rat", r"`task\.name`: input should be 'density_rate' or 'density_gradient'"),
+        (
+            "task.name=density_rat",
+            r"`task\.name`: input should be 'density_rate', 'density_gradient' or 'acceleration'",
+        ),
         ('task.features=["velocity", "densit"]', "no feature 'densit'. Did you mean 'density'"),
         ('task.features=["walls"]', "the feature 'velocity' must be one of `features`"),
         ("network.architecture=grid", "does not match any of the expected tags: 'conv_net', 'radial_net'"),

@@ -7,7 +7,7 @@ import pytest
 
 from cconv import load_model, open_dataset
 from cconv.models.errors import frame_errors, normalized_mse
-from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, OPTIONAL_FEATURES, feature_path
+from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, feature_path
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.records.run_folder import RunFolder
@@ -20,6 +20,7 @@ from cconv.study.stages.closed_form import (
     single_layers,
     without_unneeded_features,
 )
+from cconv.tasks.density_rate import DensityRate
 from cconv.tasks.samples import iterate_samples
 
 
@@ -165,7 +166,7 @@ def test_the_best_is_fitted_to_all_frames_and_tested_like_the_others(run, flow_f
 def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept, tmp_path, monkeypatch):
     def fit(session, parameters, folder, stage, seed, ridge):
         folder.start({"stage": stage, "parameters": parameters})
-        error = errors[" ".join(branch for branch in OPTIONAL_FEATURES if parameters[feature_path(branch)])]
+        error = errors[" ".join(branch for branch in DensityRate.optional if parameters[feature_path(branch)])]
         folder.append({"updates": 0, "valid_error": error, "seconds": 1.0})
 
     monkeypatch.setattr(closed_form, "fit_whole", fit)
@@ -176,9 +177,9 @@ def test_a_finalist_loses_the_branches_that_its_error_does_not_need(errors, kept
         id="found", parameters={"network.layers": 1, "task.features.walls": True, "task.features.density": True}
     )
     finalist, parameters = without_unneeded_features(session, candidate, seed=1, ridge=0.0)
-    assert " ".join(branch for branch in OPTIONAL_FEATURES if parameters[feature_path(branch)]) == kept
+    assert " ".join(branch for branch in DensityRate.optional if parameters[feature_path(branch)]) == kept
     assert finalist == "found" + "".join(
-        f"_no_{branch}" for branch in OPTIONAL_FEATURES if not parameters[feature_path(branch)]
+        f"_no_{branch}" for branch in DensityRate.optional if not parameters[feature_path(branch)]
     )
     assert session.run.finalist(finalist, 1).parameters == parameters
 

@@ -9,8 +9,8 @@ from systems import periodic_scene, periodic_trajectory
 
 from cconv.data.trajectory import ParticleType
 from cconv.data.window import window_at
-from cconv.rollout.integrators import SemiImplicitEuler
-from cconv.rollout.rollout import rollout
+from cconv.rollout.rollout import advance
+from cconv.tasks.integrators import SemiImplicitEuler
 
 EULER = SemiImplicitEuler()
 
@@ -19,7 +19,7 @@ def test_replayed_targets_are_the_stored_frames(generator):
     """Also through periodic faces: the frames are independent of each other, so particles jump anywhere."""
     scene, trajectory = periodic_scene(), periodic_trajectory(generator, num_frames=6)
     start = window_at(trajectory, 1, history=2, future=4)
-    replayed = list(itertools.islice(rollout(EULER.target, EULER, start, scene), 4))
+    replayed = list(itertools.islice(advance(EULER.target, EULER, start, scene), 4))
     for window, stored in zip(replayed, trajectory.positions[2:], strict=True):
         error = scene.box.displacement(window.present.double(), stored.double())
         assert error.abs().max() < 1e-6
@@ -41,7 +41,7 @@ def test_a_constant_acceleration_is_integrated_as_a_parabola():
     times = torch.arange(6, dtype=torch.float64)
     positions = (0.01 * times**2 / 2)[:, None, None].expand(6, 1, 2)
     window = replace(one_particle(scene), positions=positions[:2])
-    path = itertools.islice(rollout(lambda window, scene: torch.full((1, 2), 0.01), EULER, window, scene), 4)
+    path = itertools.islice(advance(lambda window, scene: torch.full((1, 2), 0.01), EULER, window, scene), 4)
     assert torch.allclose(torch.stack([window.present for window in path]), positions[2:])
 
 

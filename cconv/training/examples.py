@@ -1,0 +1,65 @@
+"""Examples: what a training learns from, sample by sample."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from cconv.tasks.samples import Sample, WindowSamples, make_step_sample
+from cconv.training.augmentation import Augmentation
+
+
+class Examples(Protocol):
+    """Samples to learn from, which may differ from update to update."""
+
+    def __len__(self) -> int:
+        """Number of samples of an epoch."""
+
+    def draw(self, index: int, update: int) -> Sample:
+        """Return one of them, as it is seen in an update."""
+
+
+@dataclass(frozen=True)
+class StoredExamples:
+    """Samples that are always the same.
+
+    Attributes:
+        samples: The samples.
+    """
+
+    samples: Sequence[Sample]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def draw(self, index: int, update: int) -> Sample:
+        """Return a sample."""
+        return self.samples[index]
+
+
+@dataclass(frozen=True)
+class AugmentedExamples:
+    """Samples of windows that are changed at random, in another way in each update, but the same after a restart.
+
+    Attributes:
+        samples: Samples of the windows.
+        augmentation: What changes a window.
+        seed: Seed of the changes, together with update and index.
+    """
+
+    samples: WindowSamples
+    augmentation: Augmentation
+    seed: int
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def draw(self, index: int, update: int) -> Sample:
+        """Return the sample of a window that was changed for this update."""
+        state = np.random.SeedSequence([self.seed, update, index]).generate_state(1, np.uint64)
+        generator = torch.Generator().manual_seed(int(state[0] >> 1))
+        scene = self.samples.scene
+        window = self.augmentation(self.samples.windows[index], scene, generator)
+        return make_step_sample(window, scene, self.samples.task)
