@@ -101,6 +101,19 @@ def flow_folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def steps_folder(tmp_path_factory):
+    """A small Taylor–Green data set with frames enough for rollouts."""
+    from cconv.data.generate import generate
+    from cconv.scenes import scene_named
+
+    def make(folder):
+        scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=10, relaxation_steps=50)
+        generate(scene, folder, num_trajectories=4, num_frames=16, workers=1)
+
+    return made_once(tmp_path_factory, "steps", make)
+
+
+@pytest.fixture(scope="session")
 def finished_run(tmp_path_factory, flow_folder):
     """Run folder of a whole serial study of the smallest size, in a process of its own that cannot import Ray."""
 

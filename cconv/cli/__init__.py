@@ -10,6 +10,7 @@ import typer
 from cconv.cli.console import errors, results
 from cconv.cli.data import app as data_app
 from cconv.cli.model import evaluate, fit, report, train
+from cconv.cli.rollout import rollout
 from cconv.cli.study import app as study_app
 from cconv.errors import CConvError, StudyError, is_disk_full, visible
 
@@ -24,7 +25,7 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
-for command in (train, fit, evaluate, report):
+for command in (train, fit, evaluate, rollout, report):
     app.command()(command)
 
 

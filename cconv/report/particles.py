@@ -5,10 +5,10 @@ Walls are grey in the plane, unless the colour shows the type, and hardly seen i
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import seaborn as sns
@@ -30,7 +30,7 @@ from cconv.errors import ConfigError, check_choice
 
 Progress = Callable[[Iterable, str], Iterable]
 
-PICTURE_DPI, ANIMATION_DPI = 130, 90
+PICTURE_DPI, ANIMATION_DPI, SIDE_BY_SIDE_DPI = 130, 90, 60
 FRAMES_PER_SECOND = 20
 _TYPE_COLORS = {
     ParticleType.PAD: "#e6e6e6",
@@ -83,7 +83,7 @@ def write_picture(figure: Figure, file: str | Path) -> None:
 
 def write_animation(
     file: str | Path,
-    trajectory: Trajectory,
+    trajectory: Trajectory | Mapping[str, Trajectory],
     scene: Scene,
     frames: Sequence[int],
     color: str = "speed",
@@ -93,9 +93,9 @@ def write_animation(
 
     Args:
         file: Where to write; .gif or .mp4 says as what.
-        trajectory: What to draw.
-        scene: Scene of the trajectory, 2D or 3D.
-        frames: Indices of frames within the trajectory.
+        trajectory: What to draw; several by their titles are drawn side by side, in the colours of the first.
+        scene: Scene of the trajectories, 2D or 3D.
+        frames: Indices of frames within the trajectories.
         color: As for `frames_chart`; the same colours hold for all frames.
         progress: Wraps the frames to show progress, given a label.
 
@@ -104,14 +104,22 @@ def write_animation(
             of range, the colour unknown or the scene 1D.
     """
     writer = animation_writer(file)
-    coloring = _coloring(color, trajectory, scene, frames, progress)
+    drawn = {"": trajectory} if isinstance(trajectory, Trajectory) else trajectory
+    first, *others = drawn.values()
+    colorings = [_coloring(color, first, scene, frames, progress)]
+    colorings += [_coloring(color, other, scene, frames, progress).as_in(colorings[0]) for other in others]
     stage = _stage(scene)
-    figure, (axes,) = _set_up(stage, coloring, trajectory, scene, 1)
-    with whole_file(Path(file)) as partial, writer.saving(figure, partial, ANIMATION_DPI):
+    figure, panels = _set_up(stage, colorings[0], first, scene, len(drawn))
+    dpi = ANIMATION_DPI if len(drawn) == 1 else SIDE_BY_SIDE_DPI
+    with whole_file(Path(file)) as partial, writer.saving(figure, partial, dpi):
         for k in progress(frames, "animation"):
-            particles = _draw_frame(axes, stage, coloring, trajectory, scene, k)
+            particles = [
+                _draw_frame(axes, stage, coloring, each, scene, k, title)
+                for axes, coloring, (title, each) in zip(panels, colorings, drawn.items(), strict=True)
+            ]
             writer.grab_frame()
-            particles.remove()
+            for artist in particles:
+                artist.remove()
 
 
 def check_picture_name(file: str | Path) -> None:
@@ -145,6 +153,9 @@ class _Coloring(Protocol):
     def draw_key(self, figure: Figure, panels: Sequence[Axes]) -> None:
         """Explain the colours beside the panels."""
 
+    def as_in(self, other: Any) -> "_Coloring":
+        """The same with the scale of another colouring of its kind, so that one key explains both."""
+
 
 @dataclass(frozen=True)
 class _ByValue:
@@ -165,6 +176,9 @@ class _ByValue:
         bar = figure.colorbar(self.scale, ax=panels, label=self.label, extend=self.extend, pad=0.02, aspect=30)
         bar.outline.set_visible(False)
 
+    def as_in(self, other: "_ByValue") -> "_ByValue":
+        return replace(self, scale=other.scale)
+
 
 @dataclass(frozen=True)
 class _ByType:
@@ -183,6 +197,9 @@ class _ByType:
             entries["boundary"] = _BOUNDARY_COLOR
         dots = [Line2D([], [], ls="", marker="o", color=color, label=label) for label, color in entries.items()]
         figure.legend(handles=dots, loc="outside right center", frameon=False)
+
+    def as_in(self, other: "_ByType") -> "_ByType":
+        return self
 
 
 def _by_speed(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByValue:
@@ -368,6 +385,9 @@ def _label_outer(panels: Sequence[Axes], columns: int) -> None:
             axes.set_xlabel("x")
 
 
-def _draw_frame(axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, k: int) -> Artist:
-    axes.set_title(f"frame {k}, t = {trajectory.time(k, scene.frame_dt):.4g}", fontsize=10)
+def _draw_frame(
+    axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, k: int, title: str = ""
+) -> Artist:
+    moment = f"frame {trajectory.first_frame + k if title else k}, t = {trajectory.time(k, scene.frame_dt):.4g}"
+    axes.set_title(f"{title}: {moment}" if title else moment, fontsize=10)
     return stage.draw(axes, trajectory[k], coloring.colors(k))

@@ -1,0 +1,138 @@
+"""`cconv rollout`: a saved model rolled out beside the stored frames."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, parse_vector
+from cconv.cli.study import DataPath
+from cconv.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cconv.data.dataset import Dataset
+    from cconv.evaluation.recorded_rollout import RecordedRollout
+
+METRICS, ANIMATION = "metrics.json", "rollout.gif"
+LONGEST_ANIMATION = 60  # frames; longer rollouts are drawn every few frames
+
+
+def rollout(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder of a model of the task acceleration.")
+    ],
+    data: DataPath = None,
+    split: Annotated[str, typer.Option(help="Split of the trajectory: train, valid or test.")] = "test",
+    trajectory: Annotated[int, typer.Option(help="Number of the trajectory in its split, from 0.")] = 0,
+    start: Annotated[int, typer.Option(help="First frame of the window that the rollout begins with, from 0.")] = 0,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of frames to predict; by default all that are stored after the window.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Folder to write: the rollout in the LagrangeBench layout (test.h5; the stored frames are train.h5 "
+            f"and valid.h5), {METRICS} and {ANIMATION}.",
+        ),
+    ] = None,
+    vtk: Annotated[bool, typer.Option("--vtk", help="Also write VTK files for ParaView, to DIR/vtk.")] = False,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+    as_json: AsJson = False,
+) -> None:
+    """Roll a saved model out by its own answers, and compare it with the stored frames.
+
+    The model is given a window of stored frames and predicts the next frame; from that it predicts the one after, and
+    so on. Ctrl-C keeps the frames so far. The exit status is 1 if the rollout diverged.
+    """
+    from cconv.data.window import window_at
+    from cconv.evaluation.recorded_rollout import record_rollout, rollout_facts
+    from cconv.models.checkpoint import load_model, read_card
+    from cconv.study.running.problem import open_card_data
+    from cconv.tasks.task import as_step
+
+    if vtk and out is None:
+        raise ConfigError("`--vtk` writes to DIR/vtk and needs `--out DIR`.")
+    if frames is not None and frames < 1:
+        raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
+    model, card = load_model(checkpoint), read_card(checkpoint)
+    history = as_step(model.task).history
+    given = {
+        "mass": mass,
+        "particle_spacing": particle_spacing,
+        "frame_dt": frame_dt,
+        "force": None if force is None else parse_vector(force),
+    }
+    dataset, _ = open_card_data(card, data, given)
+    _warn_of_spacing(dataset.scene.particle_spacing, model.config.particle_spacing)
+    if out is not None:
+        _check_free(out)
+    stored = dataset.trajectory(split, trajectory)
+    present = start + history - 1
+    future = max(1, len(stored) - present - 1) if frames is None else frames
+    recorded = record_rollout(model, window_at(stored, present, history, future), dataset.scene, show_progress)
+    if not len(recorded.positions):
+        raise ConfigError(f"{checkpoint}: no frame was predicted ({recorded.ended}); there is nothing to compare.")
+    facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
+    facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
+    if out is not None:
+        _write(out, recorded, dataset, facts, vtk)
+    if as_json:
+        print_json(facts)
+    else:
+        _print(facts, out)
+    if recorded.ended is not None:
+        raise typer.Exit(130 if recorded.ended == "interrupted" else 1)
+
+
+def _warn_of_spacing(found: float, trained: float) -> None:
+    if not math.isclose(found, trained, rel_tol=1e-6):
+        errors.print(
+            f"cconv: the data have a particle spacing of {found:g}, and the model was trained at {trained:g}; a step "
+            "to the next frame holds for the spacing and the time between frames that it was trained at.",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
+def _check_free(out: Path) -> None:
+    from cconv.data.folders import check_free
+
+    check_free(out, (), overwrite=False)
+
+
+def _write(out: Path, recorded: "RecordedRollout", dataset: "Dataset", facts: dict, vtk: bool) -> None:
+    from cconv.data.vtk import write_vtk
+    from cconv.evaluation.recorded_rollout import trajectories_of, write_rollout
+    from cconv.files import write_json
+    from cconv.report.particles import write_animation
+
+    write_rollout(out, recorded, dataset)
+    write_json(out / METRICS, facts)
+    both = trajectories_of(recorded, dataset.scene)
+    frames = range(0, len(both["rollout"]), math.ceil(len(both["rollout"]) / LONGEST_ANIMATION))
+    if vtk:
+        write_vtk(out / "vtk", both["rollout"], dataset.scene, range(len(both["rollout"])), False, show_progress)
+    if dataset.scene.dim > 1:
+        write_animation(out / ANIMATION, both, dataset.scene, frames, "speed", show_progress)
+
+
+def _print(facts: dict, out: Path | None) -> None:
+    end = "" if facts["ended"] is None else f"; it {facts['ended']}"
+    lines = [f"{facts['frames']} frames from frame {facts['first_frame'] + facts['history']} on{end}"]
+    lines += [f"MSE_{n}: {value:.4g}" for n, value in facts["mse_n"].items()]
+    energies = facts["e_kin"]
+    ratio = energies["rollout"][-1] / energies["reference"][-1] if energies["reference"][-1] > 0 else math.inf
+    lines.append(f"Kinetic energy in the last frame, relative to the stored one: {ratio:.4g}")
+    lines.append(f"Momentum drift in the last frame: {facts['momentum_drift'][-1]:.4g} of the initial momenta")
+    lines.append(f"{facts['milliseconds_per_frame']:.4g} ms per frame")
+    if out is not None:
+        lines.append(f"Written: {out}")
+    for line in lines:
+        results.print(line, soft_wrap=True)

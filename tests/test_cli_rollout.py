@@ -1,0 +1,194 @@
+"""A step is fitted, trained, evaluated and rolled out from the command line."""
+
+import json
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+
+from cconv.cli import main
+from cconv.data.dataset import open_dataset
+
+STUDY = """
+name = "steps"
+[task]
+name = "acceleration"
+history = 3
+horizon = 5
+[network]
+architecture = "radial_net"
+layers = {layers}
+first_channels = 4
+radial_terms = 6
+message = "opposite"
+relative_cutoff = 3.0
+window = "none"
+[training]
+noise = 0.01
+loss = "balanced_mse"
+updates = 6
+evaluate_every = 3
+[search]
+space = "none.toml"
+grace_updates = 3
+[stages.baseline]
+"""
+
+
+def run_main(monkeypatch, *arguments):
+    monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return caught.value.code or 0
+
+
+@pytest.fixture(scope="module")
+def fitted(steps_folder, tmp_path_factory):
+    """Checkpoint of a closed form for steps."""
+    place = tmp_path_factory.mktemp("fitted")
+    (place / "study.toml").write_text(STUDY.format(layers=1))
+    with pytest.MonkeyPatch.context() as patch:
+        code = run_main(patch, "fit", place / "study.toml", "--data", steps_folder, "--out", place / "model")
+    assert code == 0
+    return place / "model"
+
+
+def test_a_closed_form_of_steps_is_better_than_going_on(fitted, cconv):
+    code, printed, _ = cconv("evaluate", fitted, "--json")
+    assert code == 0
+    card = json.loads((fitted / "card.json").read_text())
+    assert 0 < card["valid_error"] < 1e-4
+    assert json.loads(printed)["task"] == "acceleration"
+
+
+def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, tmp_path):
+    code, printed, _ = cconv("rollout", fitted, "--out", tmp_path / "out", "--start", 2, "--frames", 7, "--vtk")
+    assert code == 0
+    assert "MSE_5: " in printed
+    assert "ms per frame" in printed
+    stored = open_dataset(steps_folder).trajectory("test", 0).positions[2:12]
+    rolled = open_dataset(tmp_path / "out")
+    found, reference = (rolled.trajectory(split, 0).positions for split in ("test", "valid"))
+    assert np.array_equal(reference, stored)
+    assert np.array_equal(found[:3], stored[:3])
+    facts = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    box = rolled.scene.box
+    errors = box.displacement(found[3:].double(), reference[3:].double()).square().mean(dim=(1, 2))
+    assert facts["mse"] == pytest.approx(errors.tolist(), rel=1e-3, abs=1e-12)
+    assert facts["mse_n"]["5"] == pytest.approx(float(errors[:5].mean()), rel=1e-3)
+    assert facts["ended"] is None
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "train.h5", "valid.h5", "test.h5", "metadata.json", "metrics.json", "rollout.gif", "vtk"
+    }  # fmt: skip
+    with h5py.File(tmp_path / "out" / "test.h5") as file:
+        assert file["00000/position"].shape == (10, 100, 2)
+
+
+def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
+    code, printed, _ = cconv("rollout", fitted, "--json")
+    facts = json.loads(printed)
+    assert code == 0
+    assert facts["frames"] == 13  # all that follow the first window
+    assert set(facts["e_kin"]) == {"rollout", "reference"}
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--frames", 40], "has 16 frames, and a window of 3 up to frame 2 and 40 after it needs frames 0 to 42"),
+        (["--start", 14], "a window of 3 up to frame 16"),
+        (["--start", -1], "needs frames -1 to"),
+        (["--frames", 0], "`--frames` must be at least 1, got 0"),
+        (["--trajectory", 3], "has 1 trajectories, counted from 0; got 3"),
+        (["--split", "tset"], "has no split 'tset'"),
+        (["--vtk"], "`--vtk` writes to DIR/vtk and needs `--out DIR`"),
+    ],
+)
+def test_what_cannot_be_rolled_out_is_one_line(options, reason, fitted, cconv):
+    code, _, printed = cconv("rollout", fitted, *options)
+    assert code == 2
+    assert reason in printed
+    assert len(printed.strip().splitlines()) == 1
+
+
+def test_a_folder_that_holds_something_is_left_alone(fitted, cconv, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    code, _, printed = cconv("rollout", fitted, "--out", tmp_path)
+    assert (code, len(printed.strip().splitlines())) == (2, 1)
+    assert "exists and is not empty" in printed
+    assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_model_of_a_field_is_refused(flow_folder, cconv, tmp_path):
+    text = STUDY.format(layers=1).replace("acceleration", "density_rate").replace("noise = 0.01", "")
+    (tmp_path / "study.toml").write_text(text.replace("history = 3", "").replace("horizon = 5", ""))
+    assert cconv("fit", tmp_path / "study.toml", "--data", flow_folder, "--out", tmp_path / "model")[0] == 0
+    code, _, printed = cconv("rollout", tmp_path / "model")
+    assert code == 2
+    assert "the task 'density_rate' is a field, and only steps are possible here" in printed
+
+
+def test_ctrl_c_keeps_the_frames_so_far(fitted, cconv, tmp_path, monkeypatch):
+    from cconv.models.model import Model
+
+    predict, answers = Model.predict_frame, SimpleNamespace(count=0)
+
+    def stops(self, frame, scene):
+        answers.count += 1
+        if answers.count > 4:
+            raise KeyboardInterrupt
+        return predict(self, frame, scene)
+
+    monkeypatch.setattr(Model, "predict_frame", stops)
+    code, printed, _ = cconv("rollout", fitted, "--out", tmp_path / "out")
+    assert code == 130
+    assert "4 frames from frame 3 on; it interrupted" in printed or "interrupted" in printed
+    assert len(open_dataset(tmp_path / "out").trajectory("test", 0)) == 7
+
+
+def test_a_rollout_that_diverges_says_so_and_ends_with_1(fitted, cconv, monkeypatch):
+    from cconv.models.model import Model
+
+    predict, answers = Model.predict_frame, SimpleNamespace(count=0)
+
+    def breaks(self, frame, scene):
+        answers.count += 1
+        return predict(self, frame, scene) * (float("nan") if answers.count > 2 else 1.0)
+
+    monkeypatch.setattr(Model, "predict_frame", breaks)
+    code, printed, _ = cconv("rollout", fitted)
+    assert code == 1
+    assert "2 frames from frame 3 on; it diverged: positions are not finite" in printed
+
+
+def test_a_network_of_several_layers_is_trained_on_noisy_windows(steps_folder, cconv, tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=2))
+    code, printed, _ = cconv("train", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "run")
+    assert code == 0
+    assert "(rollout MSE)" in printed
+    lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["updates"] for line in lines] == [3, 6]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "reason"),
+    [
+        ("history = 3", "history = 1", "`history` must be 2 to 20"),
+        ("horizon = 5", "horizon = 0", "task.horizon"),
+        ("horizon = 5", "horizon = 50", "too few for a window of 3 and 50 after it"),
+        ("noise = 0.01", "noise = -1.0", "training.noise"),
+        ('"acceleration"', '"density_rate"', "`history` must be 1 for the task 'density_rate', got 3"),
+        (
+            "relative_cutoff",
+            "conserves_momentum = true\nnormalize = true\nrelative_cutoff",
+            "needs `normalize = false`",
+        ),
+    ],
+)
+def test_settings_that_make_no_sense_are_one_line(before, after, reason, steps_folder, cconv, tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1).replace(before, after))
+    code, _, printed = cconv("fit", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "out")
+    assert code == 2
+    assert reason in printed
+    assert len(printed.strip().splitlines()) == 1
