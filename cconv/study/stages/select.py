@@ -64,6 +64,7 @@ class SelectStage(Stage):
     """Compare the finalists, recommend one, then test all of them."""
 
     kind: Literal["select"] = "select"
+    is_single = True
     uses = ("finalists", "converge")
     needs_records = True
 
