@@ -51,6 +51,7 @@ Flag = Annotated[bool, Strict()]
 Whole = Annotated[int, Strict()]  # true is no 1
 Real = Annotated[float, Strict(), AllowInfNan(False)]
 Length = Annotated[Real, Field(ge=1e-12, le=1e12)]  # or another positive quantity in the units of the data
+Horizon = Annotated[Whole, Field(ge=1, le=100_000)]  # frames of a rollout
 Seed = Annotated[Whole, Field(ge=0, lt=2**31)]  # stages count on from it, and some libraries take 32 bits
 
 LARGEST_VALUE, LONGEST_TEXT = 1e12, 4096

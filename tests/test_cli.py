@@ -5,14 +5,18 @@ import subprocess
 import sys
 from importlib.metadata import version
 
+import numpy as np
 import pytest
+from conftest import SMOKE
 from outcomes import assert_one_clear_line
 from rich.table import Table
 from rich.text import Text
 
 from cconv.cli.console import PlainConsole, plain_column
 from cconv.cli.live import StudyDisplay, TrainingBar
+from cconv.evaluation.objectives import OBJECTIVES, ErrorTable, Objective
 from cconv.study.records.run_folder import FORMAT, RunFolder
+from cconv.tasks.task import FieldTask
 
 HOSTILE = "[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"
 SHOWN = r"[/red][bold]x[/bold] :smile: \x1b[2J\x07 r[0-9]*"
@@ -116,3 +120,63 @@ def test_no_option_takes_a_number_that_makes_no_sense(cconv, tmp_path):
         status, out, _ = cconv("study", "extend", tmp_path, "--stage", "random", "--trials", trials)
         assert (status, out) == (2, "")
     assert json.dumps([path.name for path in tmp_path.iterdir()]) == "[]"
+
+
+class Largest(Objective):
+    """An error of other tasks: it has no measure of fields, and none relative to the variance of the samples."""
+
+    name, label, meaning = "largest", "largest error", "The largest error of a component."
+    measures = {"step-20 error": "Not defined for a field.", "frame count": "Number of frames."}
+
+    def error(self, model, samples, geometry=None):
+        return 0.5
+
+    def table(self, model, samples, frames_per_block):
+        measures = {"step-20 error": None, "frame count": float(len([*samples]))}
+        return ErrorTable(error=0.5, units=np.zeros(1), measures=measures)
+
+    def own_error(self, error, model, samples):
+        return None
+
+    def in_words(self, error):
+        return f"at most {error}"
+
+    def of_mean_predictor(self, samples, train_samples):
+        return 7.25
+
+
+@pytest.fixture
+def fitted(cconv, flow_folder, tmp_path):
+    """Checkpoint of a single layer, fitted in a second."""
+    layer = ("layers=1", "architecture=radial_net", "message=difference", "relative_cutoff=2.0")
+    settings = [part for value in layer for part in ("--set", f"network.{value}")]
+    assert cconv("fit", SMOKE, "--data", flow_folder, "--out", tmp_path / "one", *settings)[0] == 0
+    return tmp_path / "one"
+
+
+def test_a_model_is_evaluated_by_the_error_that_its_card_reports(cconv, fitted):
+    status, out, _ = cconv("evaluate", fitted, "--split", "valid", "--json")
+    facts, card = json.loads(out), json.loads((fitted / "card.json").read_text())
+    assert (status, facts["objective"]) == (0, "normalized_mse")
+    assert facts["normalized_mse"] == pytest.approx(card["valid_error"], rel=1e-6)
+    assert facts["relative_rmse"] == pytest.approx(facts["normalized_mse"] ** 0.5)
+    assert facts["per_frame_normalized_mse"] > 0
+    assert facts["own_normalized_mse"] > 0
+    assert facts["mean_predictor_normalized_mse"] > facts["normalized_mse"]
+    status, out, _ = cconv("evaluate", fitted, "--split", "valid")
+    figures = f"normalized MSE {facts['normalized_mse']:.6g}, relative RMSE {facts['relative_rmse']:.4g} over 4 frames "
+    assert out.startswith(f"valid: {figures}(density_gradient, ")
+
+
+def test_a_task_with_another_objective_is_evaluated_by_it(cconv, fitted, monkeypatch):
+    monkeypatch.setitem(OBJECTIVES, "largest", Largest())
+    monkeypatch.setattr(FieldTask, "objective", "largest")
+    status, out, _ = cconv("evaluate", fitted, "--split", "valid", "--json")
+    facts = json.loads(out)
+    assert (status, facts["objective"]) == (0, "largest")
+    assert (facts["step_20_error"], facts["frame_count"]) == (None, 4)
+    assert (facts["largest"], facts["own_largest"], facts["mean_predictor_largest"]) == (0.5, None, 7.25)
+    assert "normalized_mse" not in facts
+    status, out, _ = cconv("evaluate", fitted, "--split", "valid")
+    assert out.startswith("valid: largest error 0.5 over 4 frames (density_gradient, ")
+    assert "Predicting the mean of the training split here: 7.25" in out

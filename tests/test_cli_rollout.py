@@ -59,7 +59,12 @@ def test_a_closed_form_of_steps_is_better_than_going_on(fitted, cconv):
     assert code == 0
     card = json.loads((fitted / "card.json").read_text())
     assert 0 < card["valid_error"] < 1e-4
-    assert json.loads(printed)["task"] == "acceleration"
+    facts = json.loads(printed)
+    assert facts["task"] == "acceleration"
+    assert facts["diverged_rollouts"] == 0
+    assert facts["rollout_mse"] < facts["mean_predictor_rollout_mse"]
+    assert facts["frames"] == 2  # windows of 3 frames and rollouts of 5, as the study said, in 16 frames
+    assert json.loads(cconv("evaluate", fitted, "--horizon", 10, "--json")[1])["frames"] == 1
 
 
 def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, tmp_path):

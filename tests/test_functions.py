@@ -16,6 +16,7 @@ EXEMPT = {
     ("cli/data.py", "generate"),
     ("cli/data.py", "show"),
     ("cli/model.py", "evaluate"),
+    ("cli/rollout.py", "rollout"),
 }
 
 

@@ -1,6 +1,7 @@
 """`cconv train`, `cconv fit`, `cconv evaluate`, `cconv report`: one model, and the report of a run."""
 
 import math
+import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +14,10 @@ from cconv.cli.data import Force, FrameDt, Mass, Spacing, parse_vector
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
-from cconv.validation import check_setting
+from cconv.validation import Horizon, check_setting
 
 if TYPE_CHECKING:
+    from cconv.evaluation.objectives import Objective
     from cconv.models.model import Model
 
 
@@ -113,6 +115,9 @@ def evaluate(
     ],
     data: DataPath = None,
     split: Annotated[str, typer.Option(help="Split to evaluate: train, valid or test.")] = "test",
+    horizon: Annotated[
+        int | None, typer.Option(help="Frames of each rollout of a step model; by default as in its study.")
+    ] = None,
     task: Annotated[
         str | None, typer.Option(help="Required task of the model; an error if the model is for another.")
     ] = None,
@@ -128,10 +133,13 @@ def evaluate(
     Masses, spacing and time step are read from the data or given here. Those in the checkpoint are only used for the
     data that it was trained on.
     """
+    from cconv.evaluation.objectives import objective_of
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
-    from cconv.tasks.samples import compared_samples
+    from cconv.tasks.samples import HORIZON, compared_samples
 
+    if horizon is not None:
+        check_setting(Horizon, horizon, "--horizon")
     model, card = load_model(checkpoint, task), read_card(checkpoint)
     given = {
         "mass": mass,
@@ -140,12 +148,13 @@ def evaluate(
         "force": None if force is None else parse_vector(force),
     }
     dataset, is_own = open_card_data(card, data, given)
+    rolled = horizon or card.get("horizon") or HORIZON
 
     def samples(split: str, verb: str) -> list:
         label = f"{verb} {split}"
-        return list(show_progress(compared_samples(dataset, split, model.task), label))
+        return list(show_progress(compared_samples(dataset, split, model.task, rolled), label))
 
-    asked = samples(split, "read")
+    asked, objective = samples(split, "read"), objective_of(model.task)
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None
     facts = {
         "checkpoint": str(checkpoint),
@@ -153,44 +162,58 @@ def evaluate(
         "task": model.config.task,
         "split": split,
         "frames": len(asked),
-        **_errors_on(model, show_progress(asked, f"evaluate {split}"), asked, training),
+        "objective": objective.name,
+        **_errors_by(objective, model, asked, training, show_progress(asked, f"evaluate {split}")),
         "num_parameters": model.num_parameters,
         "particle_spacing": dataset.scene.particle_spacing,
         "trained_at_particle_spacing": model.config.particle_spacing,
     }
-    if not math.isfinite(facts["normalized_mse"]):
+    if not math.isfinite(facts[objective.name]):
         raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
     if as_json:
         print_json(facts)
         return
-    _print_evaluation(facts)
+    _print_evaluation(facts, objective)
 
 
-def _errors_on(model: "Model", progress: Iterable, samples: Sequence, training: Sequence | None) -> dict:
-    """Errors of a model on samples, and of predicting the mean of the training split if that is known."""
-    from cconv.evaluation.metrics import own_variance, per_frame_normalized_mse
-    from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
+def _errors_by(
+    objective: "Objective", model: "Model", samples: Sequence, training: Sequence | None, progress: Iterable
+) -> dict:
+    """Errors of a model on samples, and of predicting the mean of the training split if that is known, by their names.
 
-    frames = frame_errors(model, progress)
-    mse, variance = normalized_mse(frames), own_variance(model, samples)
-    mean = None if training is None else normalized_mse(mean_predictor_error(samples, training))
+    Args:
+        objective: The error of the model's task.
+        model: The model.
+        samples: The samples.
+        training: Samples of the training split, or None.
+        progress: The samples once more, whose reading shows the progress.
+    """
+    table = objective.table(model, progress, len(samples))
+    mean = None if training is None else objective.of_mean_predictor(samples, training)
     return {
-        "normalized_mse": mse,
-        "relative_rmse": mse**0.5,
-        "own_normalized_mse": mse / variance if variance > 0 else None,
-        "mean_predictor_normalized_mse": mean,
-        "per_frame_normalized_mse": per_frame_normalized_mse(frames),
+        objective.name: table.error,
+        f"own_{objective.name}": objective.own_error(table.error, model, samples),
+        f"mean_predictor_{objective.name}": mean,
+        **{_key(measure): value for measure, value in table.measures.items()},
     }
 
 
-def _print_evaluation(facts: Mapping) -> None:
+def _key(measure: str) -> str:
+    """Return the name of a measure in JSON."""
+    return re.sub(r"\W", "_", measure.lower())
+
+
+def _print_evaluation(facts: Mapping, objective: "Objective") -> None:
     """Print the error, the error relative to the variance of these data if it differs, and the mean predictor's."""
-    mse, own, mean = (facts[name] for name in ("normalized_mse", "own_normalized_mse", "mean_predictor_normalized_mse"))
+    error, own, mean = (facts[f"{prefix}{objective.name}"] for prefix in ("", "own_", "mean_predictor_"))
+    beside = [(name, facts[_key(name)]) for name in objective.measures][:1]
+    figures = [f"{objective.label} {error:.6g}"]
+    figures += [f"{name} {value:.4g}" for name, value in beside if value is not None]
     lines = [
-        f"{facts['split']}: normalized MSE {mse:.6g}, relative RMSE {mse**0.5:.4g} over {facts['frames']} frames "
+        f"{facts['split']}: {', '.join(figures)} over {facts['frames']} frames "
         f"({facts['task']}, {facts['num_parameters']:,} parameters)"
     ]
-    if own is not None and not math.isclose(own, mse, rel_tol=0.005):
+    if own is not None and not math.isclose(own, error, rel_tol=0.005):
         lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
     if mean is not None:
         lines.append(f"Predicting the mean of the training split here: {mean:.4g}")

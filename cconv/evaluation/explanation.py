@@ -204,7 +204,7 @@ def _learned_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
 def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
     """Measure the outputs of the analytic operator per unit of each feature (P, F, C), for mean density and mass."""
     inputs, kernel = sample.inputs.double(), model.kernel_at(1.0)
-    densities = _named(inputs.features, DENSITY)
+    densities = inputs.features.named(DENSITY)
     edges = radius_graph(inputs.positions, kernel.support_radius, inputs.box)
     mass = (densities / density(torch.ones_like(densities), edges, kernel)).mean()
     names = inputs.features.scalar_names
@@ -213,31 +213,18 @@ def _analytic_filters(model: Model, sample: Sample, pairs: _Pairs) -> Tensor:
     edges = radius_graph(pairs.positions, kernel.support_radius)
 
     def answer(flat: Tensor) -> Tensor:
-        features = _unflattened(flat, inputs.features)
+        features = inputs.features.with_values(flat)
         state = FluidState(
             positions=pairs.positions,
-            velocities=_named(features, VELOCITY),
+            velocities=features.named(VELOCITY),
             masses=mass.expand(len(flat)),
             box=None,
             kernel=kernel,
         )
-        answers = as_field(model.task).field(state.knowing(edges, _named(features, DENSITY)))
+        answers = as_field(model.task).field(state.knowing(edges, features.named(DENSITY)))
         return answers[: len(pairs.displacements)]
 
     return torch.stack([answer(raised) for raised in _raised(rest)], dim=1)
-
-
-def _unflattened(flat: Tensor, like: Features) -> Features:
-    """Features of values (N, S + V · D), with the names of others."""
-    scalars, vectors = split_kinds(flat, like.kinds, like.vectors.shape[2])
-    return Features(scalars=scalars, vectors=vectors, scalar_names=like.scalar_names, vector_names=like.vector_names)
-
-
-def _named(features: Features, name: str) -> Tensor:
-    """A scalar (N,) or a vector (N, D) by its name."""
-    if name in features.scalar_names:
-        return features.scalars[:, features.scalar_names.index(name)]
-    return features.vectors[:, features.vector_names.index(name)]
 
 
 def _component_names(features: Features) -> list[str]:
@@ -269,7 +256,7 @@ def _isolated_inputs(pairs: _Pairs, flat: Tensor, like: Inputs) -> Inputs:
     none = None if walls is None else replace(walls, scalars=walls.scalars[:0], vectors=walls.vectors[:0])
     return Inputs(
         positions=pairs.positions,
-        features=_unflattened(flat, like.features),
+        features=like.features.with_values(flat),
         wall_positions=None if none is None else pairs.positions[:0],
         wall_features=None if none is None else none.to(torch.float64),
         box=Box([0.0] * like.dim, [1.0] * like.dim),

@@ -2,14 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
 
-from cconv.evaluation.metrics import blocks_of_errors, per_frame_normalized_mse
+from cconv.evaluation.metrics import blocks_of_errors, own_variance, per_frame_normalized_mse
 from cconv.evaluation.rollout_errors import constant_rollouts, rollouts_of
 from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.models.model import Model
@@ -39,7 +39,8 @@ class Objective(ABC):
         name: Name by which tasks refer to it.
         label: Name in charts and messages.
         meaning: Explanation in sentences for readers.
-        measures: Further measures: the name of each, and its explanation in a sentence.
+        measures: Further measures: the name of each, and its explanation in a sentence. The first is printed beside
+            the error.
     """
 
     name: ClassVar[str]
@@ -58,18 +59,28 @@ class Objective(ABC):
         """
 
     @abstractmethod
-    def table(self, model: Model, samples: Sequence[Sample], frames_per_block: int) -> ErrorTable:
+    def table(self, model: Model, samples: Iterable[Sample], frames_per_block: int) -> ErrorTable:
         """Errors of a model on a split.
 
         Args:
             model: The model.
-            samples: Frames of the split, in order.
+            samples: Frames of the split, in order; they are read once.
             frames_per_block: Frames of a unit if the split has a single trajectory.
         """
 
     @abstractmethod
     def in_words(self, error: float) -> str:
         """Explain the size of an error, as the end of a sentence."""
+
+    @abstractmethod
+    def own_error(self, error: float, model: Model, samples: Iterable[Sample]) -> float | None:
+        """Error relative to the variance of the samples themselves; None where that is not defined.
+
+        Args:
+            error: Error of the model on the samples.
+            model: The model.
+            samples: The samples.
+        """
 
     @abstractmethod
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
@@ -87,22 +98,25 @@ class NormalizedMSE(Objective):
     )
     measures = {
         "relative RMSE": "The relative RMSE is the root of the normalized MSE.",
-        "per-frame MSE": "The per-frame MSE divides by each frame's own variance, as the thesis did, and serves only "
-        "to compare with it.",
+        "per-frame normalized MSE": "The per-frame normalized MSE divides by each frame's own variance, as the thesis "
+        "did, and serves only to compare with it.",
     }
 
     def error(self, model: Model, samples: Iterable[Sample], geometry: Callable | None = None) -> float:
         """Error over all particles of the samples; arguments as of `Objective.error`."""
         return normalized_mse(frame_errors(model, samples, geometry))
 
-    def table(self, model: Model, samples: Sequence[Sample], frames_per_block: int) -> ErrorTable:
+    def table(self, model: Model, samples: Iterable[Sample], frames_per_block: int) -> ErrorTable:
         """Errors over the split and its units; arguments as of `Objective.table`."""
         frames = frame_errors(model, samples)
         error = normalized_mse(frames)
         return ErrorTable(
             error=error,
             units=blocks_of_errors(frames, frames_per_block),
-            measures={"relative RMSE": math.sqrt(error), "per-frame MSE": per_frame_normalized_mse(frames)},
+            measures={
+                "relative RMSE": math.sqrt(error),
+                "per-frame normalized MSE": per_frame_normalized_mse(frames),
+            },
         )
 
     def in_words(self, error: float) -> str:
@@ -110,6 +124,11 @@ class NormalizedMSE(Objective):
         return (
             f"a typical error of {100 * math.sqrt(error):.3g} % of the spread of the true values in the training data"
         )
+
+    def own_error(self, error: float, model: Model, samples: Iterable[Sample]) -> float | None:
+        """Divide by the variance of the samples instead of that of the training split; None if they are constant."""
+        variance = own_variance(model, samples)
+        return error / variance if variance > 0 else None
 
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
         """Return the error of predicting the training mean: 1 on the training split, more where the data vary more."""
@@ -136,7 +155,7 @@ class RolloutMSE(Objective):
         """Error over all rollouts; arguments as of `Objective.error`."""
         return float(np.mean([rolled.error for rolled in rollouts_of(model, samples)]))
 
-    def table(self, model: Model, samples: Sequence[Sample], frames_per_block: int) -> ErrorTable:
+    def table(self, model: Model, samples: Iterable[Sample], frames_per_block: int) -> ErrorTable:
         """Errors over the rollouts; a unit is a trajectory, or a rollout if there is one trajectory alone."""
         rolled = rollouts_of(model, samples)
         names = [each.trajectory for each in rolled]
@@ -154,6 +173,10 @@ class RolloutMSE(Objective):
     def in_words(self, error: float) -> str:
         """Express the error as a distance."""
         return f"a typical distance of {math.sqrt(error):.3g} from the true position along each axis"
+
+    def own_error(self, error: float, model: Model, samples: Iterable[Sample]) -> float | None:
+        """Return None: the error is a squared distance, relative to no variance."""
+        return None
 
     def of_mean_predictor(self, samples: Iterable[Sample], train_samples: Iterable[Sample]) -> float:
         """Return the error of always answering the mean over the training split."""

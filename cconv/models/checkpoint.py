@@ -15,7 +15,7 @@ from cconv.errors import ConfigError, shown
 from cconv.files import read_json
 from cconv.models.model import Model, ModelConfig, without_weights
 from cconv.models.standardization import unknown
-from cconv.validation import OpenModel, Real, Seed, validated
+from cconv.validation import Horizon, OpenModel, Real, Seed, validated
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
 FORMAT = 3  # of config.json; in format 1 models computed in the units of their data, in 2 features had no names
@@ -27,6 +27,7 @@ class _Card(OpenModel):
 
     data: dict = {}
     data_seed: Seed = 0
+    horizon: Horizon | None = None
     valid_error: Real | None = None
 
 

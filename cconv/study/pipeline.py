@@ -167,7 +167,7 @@ def _session(
             start_pool=start_pool,
             count_cost=count_cost,
             progress=progress,
-            useless_error=problem.objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
+            useless_error=problem.objective.of_mean_predictor(problem.valid_samples, problem.typical_samples),
         )
 
 

@@ -18,7 +18,7 @@ from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.errors import ShapeError
 from cconv.neighbors import Edges, radius_graph
-from cconv.nn.kinds import Kinds, join_kinds
+from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.sph.kernels import AbstractKernel
 from cconv.sph.operators import density
 
@@ -95,6 +95,17 @@ class Features:
     def flat(self) -> Float[Tensor, "N C"]:
         """Scalars and the components of the vectors, (N, S + V · D)."""
         return join_kinds(self.scalars, self.vectors)
+
+    def with_values(self, flat: Float[Tensor, "M C"]) -> "Features":
+        """Features of the same names with other values, in the order of `flat`, (M, S + V · D)."""
+        scalars, vectors = split_kinds(flat, self.kinds, self.vectors.shape[2])
+        return replace(self, scalars=scalars, vectors=vectors)
+
+    def named(self, name: str) -> Float[Tensor, "N ..."]:
+        """Return the first scalar (N,) or vector (N, D) of a name."""
+        if name in self.scalar_names:
+            return self.scalars[:, self.scalar_names.index(name)]
+        return self.vectors[:, self.vector_names.index(name)]
 
     def select(self, names: Collection[str]) -> "Features":
         """Those of some names, in their own order.

@@ -82,6 +82,7 @@ def test_many_units_give_the_interval_of_the_law_of_large_numbers(rng):
     low, high = crossed_interval(table)
     width = 1.96 * scipy.stats.sem(table[0])
     assert (low, high) == pytest.approx((table.mean() - width, table.mean() + width), rel=0.01)
+    assert high - low == pytest.approx(2 * width, rel=0.2)
 
 
 def test_errors_below_what_float32_resolves_count_as_that(rng):

@@ -114,6 +114,16 @@ def test_analytic_sph_and_the_densitys_symbols_are_not_spoken_of_where_the_task_
     assert not [word for word in ("Dρ/Dt", "∇ρ", "normalized MSE", "nalytic SPH") if word in text]
 
 
+def test_an_exact_model_has_no_ratio_of_errors(run):
+    summary = run.summary()
+    exact = changed(summary.chosen, test=changed(summary.chosen.test, error=0.0, ci95=(0.0, 0.0)))
+    finalists = [exact if entry.id == exact.id else entry for entry in summary.finalists]
+    run.write_summary(changed(summary, finalists=finalists))
+    text = words(render_report(run))
+    assert "has a normalized MSE of 0 (" in text
+    assert "Compared with the recommended model, its time " in text
+
+
 def test_an_interval_that_is_not_given_has_its_reason(run, no_charts):
     summary, none = run.summary(), {"ci95": None, "why_no_interval": "2 units say too little of others"}
     finalists = [changed(entry, test=changed(entry.test, **none)) for entry in summary.finalists]

@@ -41,6 +41,14 @@ def test_flat_features_have_the_scalars_first(state):
     assert torch.equal(features.flat(), torch.cat([features.scalars, features.vectors[:, 0]], dim=1))
 
 
+def test_flat_features_become_features_of_the_same_names_again(state):
+    features = make_inputs(state, None, periodic_scene(), NAMES).features
+    again = features.with_values(2 * features.flat()[:5])
+    assert again.names == features.names
+    assert torch.equal(again.named("density"), 2 * features.scalars[:5, 1])
+    assert torch.equal(again.named("velocity"), 2 * features.vectors[:5, 0])
+
+
 def test_features_are_selected_by_name(generator):
     frame = with_walls(periodic_frame(generator))
     whole, bare = inputs_of(frame), inputs_of(frame, ("one", "velocity"))

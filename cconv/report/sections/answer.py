@@ -30,9 +30,10 @@ def _lead(text: str) -> tuple[str, str]:
     return first + stop.strip(), others
 
 
-def _ratios(baseline: FinalistEntry, chosen: FinalistEntry) -> dict[str, float]:
+def _ratios(baseline: FinalistEntry, chosen: FinalistEntry) -> dict[str, float | None]:
+    """Divide error, time and size of the baseline by those of the recommended model; no ratio to an error of 0."""
     return {
-        "error": baseline.test.error / chosen.test.error,
+        "error": baseline.test.error / chosen.test.error if chosen.test.error else None,
         "time": baseline.cost.ms_per_frame / chosen.cost.ms_per_frame,
         "size": baseline.num_parameters / chosen.num_parameters,
     }

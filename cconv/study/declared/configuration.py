@@ -13,7 +13,7 @@ from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
 from cconv.tasks.task import StepTask
-from cconv.validation import Length, OneOf, Real, StrictModel, Value, Whole
+from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
@@ -43,7 +43,7 @@ class TaskConfig(StrictModel):
     smoothing_length: Length | None = None
     features: tuple[str, ...] | None = Field(None, max_length=100)
     history: Whole | None = None
-    horizon: Whole | None = Field(None, ge=1, le=100_000)
+    horizon: Horizon | None = None
 
     @field_validator("kernel")
     @classmethod

@@ -30,6 +30,7 @@ class Stage(StrictModel, ABC):
         uses: Kinds of stages whose records it can read.
         needs_records: Whether it can do nothing without a stage to read.
         space_kinds: Kinds of stages whose narrowed space it can search.
+        is_single: Whether a study has at most one stage of the kind, because the summary has one place for its result.
         reads: Names of the stages whose records it uses; None means every earlier one of a kind that it can use.
         kind: Its kind, by which the study file chooses the class.
     """
@@ -37,6 +38,7 @@ class Stage(StrictModel, ABC):
     uses: ClassVar[tuple[str, ...]] = ()
     needs_records: ClassVar[bool] = False
     space_kinds: ClassVar[tuple[str, ...]] = ()
+    is_single: ClassVar[bool] = False
     reads: tuple[Name, ...] | None = None
     kind: str
 
@@ -125,18 +127,29 @@ def _check_finalist_names(stages: Mapping[str, Stage]) -> None:
 
 
 def check_order(stages: Mapping[str, Stage]) -> None:
-    """Check that every stage reads earlier stages that it can use.
+    """Check that every stage reads earlier stages that it can use, and that no result would replace another's.
 
     Raises:
         ValueError: With the stage, what is wrong, and the nearest name.
     """
     for name in stages:
+        _check_no_other_is_of_a_single_kind(stages, name)
         _check_named_stages_are_earlier(stages, name)
         _check_named_stages_are_usable(stages, name)
         _check_named_finalists(stages, name)
         stage = stages[name]
         if stage.needs_records and not reads_of(stages, name):
             raise ValueError(f"stage `{name}` has nothing to read; put one of {', '.join(stage.uses)} before it")
+
+
+def _check_no_other_is_of_a_single_kind(stages: Mapping[str, Stage], name: str) -> None:
+    kind = stages[name].kind
+    first = next(other for other, stage in stages.items() if stage.kind == kind)
+    if stages[name].is_single and first != name:
+        raise ValueError(
+            f"stages `{first}` and `{name}` are both of kind {kind}, and the summary holds the result of one; remove "
+            "one of them, or give it a study of its own"
+        )
 
 
 def _check_named_stages_are_earlier(stages: Mapping[str, Stage], name: str) -> None:

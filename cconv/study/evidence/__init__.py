@@ -1,1 +1,1 @@
-"""Statistics over records; nothing here trains, and nothing loads torch or Ray."""
+"""Statistics over records. No file here trains a model or loads torch or Ray."""

@@ -1,4 +1,4 @@
-"""In which order to turn the baseline into the best configuration, one hyperparameter at a time."""
+"""Order the changes that turn the baseline into the best configuration, one hyperparameter at a time."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,9 +18,10 @@ def ablation_order(
     *,
     useless_error: float,
 ) -> list[str]:
-    """Hyperparameters in which two configurations differ, each time the one that a surrogate says helps most.
+    """Order the hyperparameters in which two configurations differ: next is the one with the smallest predicted error.
 
-    A hyperparameter that only one of the two has is not in the order: it comes or goes with the one it depends on.
+    A hyperparameter that only one of the two has is not in the order: it is added or removed together with the one that
+    it depends on.
 
     Source: the greedy path of Fawcett and Hoos, "Analysing differences between algorithm configurations through
     ablation", J. Heuristics 22 (2016), with predicted errors as in Biedenkapp et al., "Efficient Parameter Importance
@@ -32,15 +33,17 @@ def ablation_order(
         baseline: Configuration at the start.
         best: Configuration at the end.
         updates: Budget at which errors are taken.
-        seed: Of the surrogate.
-        useless_error: Error of predicting the mean, up to which errors count.
+        seed: Seed of the surrogate.
+        useless_error: Error of predicting the mean; larger errors are replaced by it.
 
     Raises:
-        ConfigError: If fewer than ten trials have these updates.
+        ConfigError: If fewer than ten trials have an error after these updates.
     """
     trials, targets = trials_at(records, updates, useless_error=useless_error)
     if len(trials) < FEWEST_TRIALS:
-        raise ConfigError(f"{len(trials)} trials have {updates} updates; a surrogate needs {FEWEST_TRIALS}.")
+        raise ConfigError(
+            f"{len(trials)} trials have an error after {updates} updates; a surrogate needs {FEWEST_TRIALS}."
+        )
     axes = axes_of(space)
     surrogate = Surrogate(axes, seed=seed).fit(coordinates(axes, [trial.parameters for trial in trials]), targets)
     left = [name for name in baseline if name in best and baseline[name] != best[name]]
@@ -53,13 +56,15 @@ def ablation_order(
 
 
 def path_configurations(baseline: Mapping, best: Mapping, order: Sequence[str], space: SearchSpace) -> list[dict]:
-    """The baseline, then a configuration after each change of the order; the last is the best.
+    """List the baseline and the configuration after each change of the order; the last one is the best.
 
-    A hyperparameter comes and goes with those it depends on, with the value of the configuration that has it.
+    A hyperparameter is added or removed together with those that it depends on. Its value is that of the configuration
+    that has it.
     """
     return [_between(baseline, best, order[:count], space) for count in range(len(order) + 1)]
 
 
 def _between(baseline: Mapping, best: Mapping, changed: Sequence[str], space: SearchSpace) -> dict:
+    """Return the baseline with some hyperparameters as in the best configuration."""
     values = {name: parameter.baseline for name, parameter in space.parameters.items()} | dict(best) | dict(baseline)
     return space.active(values | {name: best[name] for name in changed})

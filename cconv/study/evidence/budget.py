@@ -1,4 +1,4 @@
-"""What the budget of a training decided: whether its error was still falling, and what larger budgets brought."""
+"""The influence of the training budget: whether the error still fell at the end, and what larger budgets gain."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,11 +12,11 @@ LAST_PART = 0.25  # of the updates of a training
 
 
 def still_falling(points: Sequence[BudgetPoint], margin: float) -> bool:
-    """Whether the last budget lowered the validation error of the one before it by more than `margin`, a share.
+    """Tell whether the last budget lowered the validation error of the one before it by more than a share of it.
 
     Args:
-        points: Trainings with ascending budgets; a single one says nothing, so True.
-        margin: Share of the error.
+        points: Trainings with ascending budgets; the answer is True if there is only one.
+        margin: The share.
     """
     if len(points) < 2:
         return True
@@ -25,9 +25,9 @@ def still_falling(points: Sequence[BudgetPoint], margin: float) -> bool:
 
 
 def fall_at_the_end(records: Sequence[TrialRecord]) -> float | None:
-    """Share by which the best validation error of trainings fell in the last quarter of their updates, mean over seeds.
+    """Return the share by which the best validation error fell in the last quarter of the updates, mean over seeds.
 
-    None where nothing was measured before that quarter, as for models that are fitted and not trained.
+    It is None if no error was measured before that quarter, as for models that are fitted and not trained.
     """
     falls = []
     for record in records:
@@ -40,12 +40,12 @@ def fall_at_the_end(records: Sequence[TrialRecord]) -> float | None:
 
 
 def budget_words(finalists: Sequence[FinalistEntry], convergence: Mapping[str, Convergence], margin: float) -> str:
-    """What a budget decided, in sentences; "" where no model gained from a larger one or was still improving.
+    """Describe in sentences whose error the budget limits; "" if no model gains from more updates.
 
     Args:
         finalists: The finalists.
-        convergence: What the converge stages found, by model.
-        margin: Share of the error below which a gain counts as none.
+        convergence: Errors with larger budgets, by model.
+        margin: Share of the error; a smaller gain is ignored.
     """
     sentences = [_gain(name, found) for name, found in convergence.items() if len(found.points) > 1]
     longer = {point.id for found in convergence.values() for point in found.points}
@@ -56,15 +56,15 @@ def budget_words(finalists: Sequence[FinalistEntry], convergence: Mapping[str, C
     ]
     if falling:
         sentences.append(
-            f"A budget decided the error of {', '.join(falling)}: it was still falling when the updates ended."
+            f"The budget limits the error of {', '.join(falling)}: it was still falling when the training ended."
         )
     return " ".join(sentences)
 
 
 def _gain(name: str, found: Convergence) -> str:
     first, last = found.points[0], found.points[-1]
-    end = "and it was still falling" if found.still_falling else "and more updates bring nothing"
+    end = "and it was still falling" if found.still_falling else "and more updates do not lower it"
     return (
-        f"The budget of {first.updates:,} updates decided the error of {name}, {first.valid_error:.3g}: "
-        f"after {last.updates:,} updates it is {last.valid_error:.3g} (validation), {end}."
+        f"The budget of {first.updates:,} updates limits the validation error of {name} to {first.valid_error:.3g}: "
+        f"after {last.updates:,} updates it is {last.valid_error:.3g}, {end}."
     )

@@ -1,9 +1,9 @@
-r"""How much of the differences between trials one hyperparameter decides: its share with an interval, and tests.
+r"""The share of the variance of a target that one hyperparameter alone explains, with an interval and a test.
 
-The share is that of the variance of the target that the hyperparameter alone explains. Trials draw hyperparameters at
-random, so that a sample varies them more or less than the space does: given the draws, F is noncentral with
-:math:`\lambda = g\,s / (1 - s)`, where s is the share and g the scatter of the drawn effect by its variance, about
-Gamma-distributed with mean n - 1 and variance (n - 1)(kurtosis - 1). Sources: Steiger, "Beyond the F test",
+Trials draw hyperparameters at random, so that they vary more or less in a sample than in the space. Given the draws, F
+follows the noncentral distribution with :math:`\lambda = g\,s / (1 - s)`, where s is the share and g the sum of squares
+of the effect in the sample, divided by its variance in the space. Approximately, g follows a Gamma distribution of mean
+n - 1 and variance (n - 1)(kurtosis - 1). Sources: Steiger, "Beyond the F test",
 Psychological Methods 9 (2004), for a fixed g; Gatsonis and Sampson, "Multiple correlation: exact power and sample size
 calculations", Psychological Bulletin 106 (1989), for normal draws, whose kurtosis is 3.
 tests/evaluation/test_coverage.py simulates how often the interval holds the true share.
@@ -17,27 +17,27 @@ import numpy as np
 import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
-FAMILY_LEVEL = 0.05  # chance that any hyperparameter of a space is found where none decides anything
-POWER = 0.8  # chance to find a hyperparameter of the detectable share
-_EVEN_KURTOSIS = 1.8  # of an effect that is a straight line over an evenly drawn range
-_ENDS = (0.975, 0.025)  # chance of a smaller F at the lower and upper end of a 95 % interval
+FAMILY_LEVEL = 0.05  # familywise: probability of finding any hyperparameter where none has an effect
+POWER = 0.8  # probability of finding a hyperparameter of the detectable share
+_EVEN_KURTOSIS = 1.8  # of an effect that is linear in a uniformly drawn value
+_ENDS = (0.975, 0.025)  # probability of a smaller F at the lower and upper end of a 95 % interval
 _LARGEST_SHARE = 1 - 1e-6
-_SMALL_SHARE = 0.02  # below, the influence function says nothing of the share, which is quadratic there
-_DRAWS = (np.arange(8) + 0.5) / 8  # quantiles of the scatter that stand for all
+_SMALL_SHARE = 0.02  # below it the estimate of the share is quadratic, and its influence function is no guide
+_DRAWS = (np.arange(8) + 0.5) / 8  # levels of the quantiles that represent the distribution of g
 _TINY = 1e-100
 
 
 @dataclass(frozen=True)
 class Effects:
-    """What a fit says of the effect of one hyperparameter in each of some samples; arrays of the shape of the samples.
+    """The fitted effect of one hyperparameter in each of several samples; arrays have the shape of the samples.
 
     Attributes:
         degrees: Degrees of freedom of the effect; 0 where the sample does not vary the hyperparameter.
-        spare: Degrees of freedom that are left.
+        spare: Degrees of freedom of the residuals.
         statistic: F.
         kurtosis: Kurtosis of the fitted effect over the trials.
-        widening: Standard error of the share as its influence function gives it, by that with normal residuals; at
-            least 1, and more for residuals with tails or a ceiling.
+        widening: Standard error of the share by its influence function ÷ that for normal residuals; at least 1, and
+            larger for residuals with long tails or a ceiling.
     """
 
     degrees: NDArray[np.int64]
@@ -48,22 +48,22 @@ class Effects:
 
     @property
     def is_testable(self) -> NDArray[np.bool_]:
-        """Whether there is an effect to test and something left to test it against."""
+        """True if the effect and the residuals have degrees of freedom, so that a test is possible."""
         return (self.degrees > 0) & (self.spare > 0)
 
     @property
     def p_value(self) -> NDArray[np.float64]:
-        """Chance of an F as large where the hyperparameter decides nothing."""
+        """Probability of an F at least as large if the hyperparameter has no effect."""
         return _p_value(self)
 
     @property
     def share(self) -> NDArray[np.float64]:
-        """Estimated share of the variance: epsilon squared, which chance alone does not raise above 0 on average."""
+        """Estimated share of the variance: epsilon squared, which corrects for the degrees of freedom."""
         return _adjusted(self.statistic, self.degrees, self.spare)
 
     @property
     def interval95(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Ends of the 95 % interval of the true share; where that is 0, 97.5 % of such intervals hold it."""
+        """Ends of the 95 % interval of the true share; if that is 0, 97.5 % of such intervals include it."""
         estimate = _stretched(self.share)
         ends = (_stretched(_last_where(self._is_below(end), self.share)) for end in _ENDS)
         low, high = (estimate + self.widening * (end - estimate) for end in ends)
@@ -75,10 +75,10 @@ class Effects:
 
 
 def effects(columns: NDArray[np.float64], targets: NDArray[np.float64]) -> Effects:
-    """Fit columns and a constant to targets by least squares, each sample by itself.
+    """Fit columns and a constant to the targets of each sample by least squares.
 
     Args:
-        columns: What the effect is a sum of, (..., M, K) for M trials.
+        columns: Terms of the effect, (..., M, K) for M trials.
         targets: (..., M), not all equal.
     """
     fit = _fit(columns, targets)
@@ -112,7 +112,7 @@ def _fit(columns: NDArray[np.float64], targets: NDArray[np.float64]) -> _Fit:
 
 
 def _robust_variance(fit: _Fit, share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variance over trials of the influence of each on the share, its residual and effect freed of overfitting."""
+    """Return the variance over trials of the influence of each on the share, corrected for overfitting."""
     count = fit.centred.shape[-1]
     residuals = (fit.centred - fit.fitted) * np.sqrt((count - 1) / np.maximum(fit.spare, 1))[..., None]
     true = residuals + fit.fitted * np.sqrt(share / np.maximum(fit.explained, _TINY))[..., None]
@@ -123,16 +123,17 @@ def _robust_variance(fit: _Fit, share: NDArray[np.float64]) -> NDArray[np.float6
 def adjusted_p_values(
     columns: Sequence[NDArray[np.float64]], targets: NDArray[np.float64], *, seed: int, permutations: int = 999
 ) -> NDArray[np.float64]:
-    """Chance that any of several hyperparameters has an F test as significant, where none of them decides anything.
+    """Compute p-values of several hyperparameters, adjusted for their number.
 
-    The targets are permuted over the trials, so that it holds for targets of any distribution, ties among them too.
+    Each is the probability that any hyperparameter has a p-value as small if none has an effect. It comes from
+    permutations of the targets over the trials, and so holds for targets of any distribution, with ties too.
     Source: Westfall and Young, "Resampling-Based Multiple Testing" (1993), single-step minP.
 
     Args:
-        columns: Of each hyperparameter, (M, K), that vary over the M trials.
+        columns: Terms of the effect of each hyperparameter, (M, K), which vary over the M trials.
         targets: (M,), not all equal.
         seed: Seed of the permutations.
-        permutations: Their number.
+        permutations: Number of permutations.
     """
     shuffled = np.random.default_rng(seed).permuted(np.tile(targets, (permutations, 1)), axis=1)
     smallest = np.min([_p_value(_fit(each, shuffled)) for each in columns], axis=0)
@@ -141,12 +142,14 @@ def adjusted_p_values(
 
 
 def detectable_share(degrees: int, trials: int, tests: int) -> float:
-    """Smallest share of the variance that is found with `POWER`, among so many independent tests (Šidák, 1967).
+    """Return the smallest share of the variance that is found with a probability of `POWER`.
+
+    The level of each test is that of several independent tests with the familywise level `FAMILY_LEVEL` (Šidák, 1967).
 
     Args:
         degrees: Degrees of freedom of the effect.
         trials: Number of trials, more than `degrees` + 1.
-        tests: Number of hyperparameters of which any is found by chance in `FAMILY_LEVEL` of the cases.
+        tests: Number of tests, one a hyperparameter.
     """
     spare = trials - 1 - degrees
     critical = scipy.special.fdtri(degrees, spare, (1 - FAMILY_LEVEL) ** (1 / tests))
@@ -175,7 +178,7 @@ def _squeezed(stretched: NDArray) -> NDArray[np.float64]:
 def _chance_below(
     statistic: ArrayLike, share: ArrayLike, degrees: ArrayLike, spare: ArrayLike, kurtosis: ArrayLike
 ) -> NDArray[np.float64]:
-    """Chance of a smaller F if this is the true share, over draws of the scatter of the effect."""
+    """Return the probability of a smaller F given the true share, averaged over the distribution of g."""
     spread = np.maximum(np.asarray(kurtosis, dtype=np.float64) - 1, 1e-3)[..., None]
     trials = (np.asarray(degrees) + np.asarray(spare) + 1)[..., None]
     scatter = spread * scipy.special.gammaincinv((trials - 1) / spread, _DRAWS)
@@ -185,7 +188,7 @@ def _chance_below(
 
 
 def _last_where(holds: Callable[[NDArray], NDArray], like: ArrayLike, steps: int = 24) -> NDArray[np.float64]:
-    """Largest share at which something holds that holds for small shares or for none, by bisection."""
+    """Find by bisection the largest share at which a condition holds that holds for all smaller ones; 0 if for none."""
     low, high = np.zeros(np.shape(like)), np.full(np.shape(like), _LARGEST_SHARE)
     for _ in range(steps):
         middle = (low + high) / 2

@@ -1,4 +1,4 @@
-"""The front of error against cost with its uncertainty: hypervolume, and what is attained at each cost."""
+"""The Pareto front of error and cost with its uncertainty: hypervolume and attainment."""
 
 import statistics
 from collections.abc import Iterable, Mapping
@@ -16,7 +16,7 @@ class Timing:
     """Time of a model, timed in turn with others.
 
     Attributes:
-        turns: Time of each turn, ms per frame; the same turn of all models met the same frame and the same machine.
+        turns: Time of each turn, ms per frame; in a turn all models predict the same frame on the same machine.
     """
 
     turns: tuple[float, ...]
@@ -27,12 +27,12 @@ class Timing:
         return statistics.median(self.turns)
 
     def is_slower(self, other: "Timing") -> bool:
-        """Whether it takes longer than another beyond the noise of the timing, by `times_tie`."""
+        """Tell whether it takes longer than another beyond the noise of the timing, by `times_tie`."""
         return self.ms > other.ms and not times_tie(self.turns, other.turns)
 
 
 def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Names of the points that no other point beats in one value without losing in the other.
+    """List the names on the Pareto front: no other point is at least as good in both values and better in one.
 
     Args:
         points: (error, cost) of each name; smaller is better.
@@ -50,7 +50,7 @@ def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
 
 
 def timed_front(errors: Mapping[str, float], times: Mapping[str, Timing]) -> list[str]:
-    """Names of the models than which no more accurate one is as fast, times within their noise being ties.
+    """List the models for which no more accurate one is as fast; times that differ within their noise are ties.
 
     Args:
         errors: Error of each model.
@@ -61,21 +61,21 @@ def timed_front(errors: Mapping[str, float], times: Mapping[str, Timing]) -> lis
     """
     order = sorted(errors, key=lambda name: (errors[name], times[name].ms))
     front: list[str] = []
-    for name in order:  # from the most accurate on: one stays if it is faster than all that are more accurate
+    for name in order:  # from the most accurate on: a model stays if it is faster than all more accurate ones
         if all(times[better].is_slower(times[name]) for better in order[: order.index(name)]):
             front.append(name)
     return front[::-1]
 
 
 def hypervolume(points: Iterable[tuple[float, float]], reference: tuple[float, float]) -> float:
-    """Area that points dominate on log10 axes, up to a reference point, in decades of error times decades of cost.
+    """Compute the area that points dominate on log10 axes up to a reference point, in decades of error times cost.
 
     Source: Zitzler and Thiele, "Multiobjective Evolutionary Algorithms", IEEE Transactions on Evolutionary Computation
     3 (1999). In two dimensions a sweep along the cost is exact.
 
     Args:
         points: (error, cost) of each model, positive; those beyond the reference dominate nothing.
-        reference: (error, cost) of the corner; store it, as areas compare only for the same one.
+        reference: (error, cost) of the corner; areas can only be compared for the same corner.
     """
     corner_error, corner_cost = np.log10(reference)
     logarithms = [tuple(np.log10(point)) for point in points]
@@ -91,14 +91,14 @@ def hypervolume(points: Iterable[tuple[float, float]], reference: tuple[float, f
 def hypervolume_interval(
     errors: Mapping[str, np.ndarray], cost: Mapping[str, float], reference: tuple[float, float]
 ) -> Hypervolume:
-    """Hypervolume of the typical errors of all models, with its 95 % interval over other seeds and units.
+    """Compute the hypervolume of the geometric mean errors of all models, with its 95 % interval over seeds and units.
 
-    A typical error is the geometric mean over seeds and units. On logarithmic axes the area is a sum of the logarithms
-    of the errors on the front times the steps in cost, so that each seed and unit has an area of its own, and the
-    interval is that of their mean. It takes for granted which models are on the front.
+    On logarithmic axes the area is a sum of the logarithms of the errors on the front times the steps in cost. So each
+    seed and unit has an area of its own, and the interval is that of their mean. It assumes that the models on the
+    front are the same for other seeds and units.
 
     Args:
-        errors: Errors (seeds, units) by model; the units are those of all models.
+        errors: Errors (seeds, units) by model, with the same units.
         cost: Cost by model, e.g. ms per frame.
         reference: (error, cost) of the corner.
 
@@ -141,12 +141,14 @@ def attainment(
     draws: int = 1000,
     seed: int = 0,
 ) -> list[AttainmentStep]:
-    """Error that one training of each model attains at a cost: a band of step functions.
+    """Compute the error that one training of each model attains at a cost, as a band of step functions.
 
-    A draw takes one seed of each model, and its mean error over the units; the smallest error among the models of at
-    most a given cost is what it attains there. The band describes the seeds that were trained and is no confidence
-    interval: others may fall outside more often. Source: Grunert da Fonseca, Fonseca and Hall, "Inferential
-    Performance Assessment of Stochastic Optimisers and the Attainment Function" (EMO 2001).
+    A draw takes one seed of each model and its mean error over the units. The error that the draw attains at a cost is
+    the smallest one among the models of at most that cost. The band describes the seeds that were trained and is no
+    confidence interval: other seeds may fall outside it more often.
+
+    Source: Grunert da Fonseca, Fonseca and Hall, "Inferential Performance Assessment of Stochastic Optimisers and the
+    Attainment Function" (EMO 2001).
 
     Args:
         errors: Errors (seeds, units) by model.
@@ -156,7 +158,7 @@ def attainment(
         seed: Seed of the draws.
 
     Returns:
-        A step at each model's cost, in ascending order.
+        A step at the cost of each model, in ascending order.
 
     Raises:
         ShapeError: If the models differ in their units.

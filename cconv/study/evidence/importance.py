@@ -1,11 +1,11 @@
-"""Which hyperparameters decide the error, at each rung apart, and how strong one must be for so many trials to find it.
+"""Importance of the hyperparameters at each rung, and the smallest importance that so many trials can detect.
 
-The answer is a test: which share of the variance of log10 error does a hyperparameter decide alone, and is that more
-than chance (`cconv.study.evidence.effects`)? Beside it stand two methods without intervals, as none that was tried
-holds the true value often enough with few trials. f-ANOVA (Hutter et al., "An Efficient Approach for Assessing
+The importance is the share of the variance of log10 error that a hyperparameter alone explains, with an interval and a
+test (`cconv.study.evidence.effects`). Two other methods are given without intervals, because with few trials no
+interval that was tried covers the true value often enough. f-ANOVA (Hutter et al., "An Efficient Approach for Assessing
 Hyperparameter Importance", ICML 2014) estimates the same share by a random forest. PED-ANOVA (Watanabe et al., "PED-
-ANOVA: Efficiently Quantifying Hyperparameter Importance in Arbitrary Subspaces", IJCAI 2023) asks by which
-hyperparameters the best trials differ from all. All of them belong on trials that were drawn at random.
+ANOVA: Efficiently Quantifying Hyperparameter Importance in Arbitrary Subspaces", IJCAI 2023) measures how much the best
+trials differ from all trials in a hyperparameter. All of them need trials that were drawn at random.
 """
 
 import math
@@ -26,7 +26,7 @@ from cconv.study.records.trials import TrialRecord
 
 _TREES = 12
 _NONE: dict = {"detectable_share": None, "surrogate_r2": None, "best_share": None, "parameters": {}}
-_BEST_SHARE, _FEWEST_BEST = 0.1, 5  # PED-ANOVA's best trials: a tenth, but no fewer than Optuna advises
+_BEST_SHARE, _FEWEST_BEST = 0.1, 5  # PED-ANOVA's best trials: a tenth, but at least as many as Optuna advises
 
 
 def importance_by_rung(
@@ -37,19 +37,19 @@ def importance_by_rung(
     useless_error: float,
     seed: int = 0,
 ) -> list[RungImportance]:
-    """Importance of every hyperparameter at each rung, from the trials that have an error at exactly that rung.
+    """Estimate the importance of every hyperparameter at each rung, from the trials with an error at exactly that rung.
 
     Args:
         records: Trials of one stage that drew at random.
         space: The space that they were drawn from.
         rungs: Numbers of updates, ascending.
-        useless_error: Error up to which errors count: that of predicting the mean, or the one at which trials are given
-            up, if that is smaller.
-        seed: Of permutations and forests.
+        useless_error: Error of predicting the mean, or the error at which trials are given up, if that is smaller;
+            larger errors are replaced by it.
+        seed: Seed of permutations and forests.
 
     Returns:
-        One entry a rung. Where trials that were stopped before are missing, what is left is a selection. The
-        detectable share is found whichever hyperparameter has it; the surrogate is f-ANOVA's kind of forest.
+        One entry a rung. It says whether trials are missing because they were stopped before, which makes the others a
+        selection. The detectable share holds for every hyperparameter; the R² is that of a forest like f-ANOVA's.
     """
     axes = axes_of(space)
     entries = []
@@ -71,13 +71,14 @@ def importance_by_rung(
 
 
 def _lacks_stopped(records: Sequence[TrialRecord], counted: Sequence[TrialRecord], updates: int) -> bool:
+    """Tell whether a trial is not counted because it was stopped before these updates."""
     known = {record.id for record in counted}
     stopped = (record for record in records if record.outcome == "stopped" and record.id not in known)
     return any(record.log and record.log[-1]["updates"] < updates for record in stopped)
 
 
 def _why_none(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], clipped: int) -> str:
-    """Too few trials, too few below the useless error, or no difference: the reason in words, or ""."""
+    """Return the reason why there is no importance, e.g. too few trials or useful ones; or ""."""
     trials = len(targets)
     if trials < FEWEST_TRIALS:
         return f"{trials} trials were measured, and at least {FEWEST_TRIALS} are needed"
@@ -114,7 +115,7 @@ def _measure(axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray
 def _tests(
     axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
 ) -> tuple[dict[str, dict], float]:
-    """Share, interval and test of each axis alone, and the share that is found whichever axis has it."""
+    """Return share, interval and test of each axis, and the share that is detectable for every axis."""
     columns = {axis.name: _columns(axis, points[:, k]) for k, axis in enumerate(axes)}
     found = {name: effects(each, targets) for name, each in columns.items()}
     testable = [name for name, effect in found.items() if effect.is_testable]
@@ -130,7 +131,7 @@ def _tests(
 
 
 def _columns(axis: Axis, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A curve of degree two for a range, the mean of each value for a choice."""
+    """Return the terms of the effect of an axis: a parabola for a range, the mean of each value for a choice."""
     if axis.levels is not None:
         return np.equal.outer(coordinates, np.arange(len(axis.levels))).astype(np.float64)
     low, high = axis.bounds
@@ -141,7 +142,7 @@ def _columns(axis: Axis, coordinates: NDArray[np.float64]) -> NDArray[np.float64
 def _f_anova(
     axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], seed: int
 ) -> NDArray[np.float64]:
-    """Share of variance of each axis alone; whole numbers get a cell each, as all are drawn equally often."""
+    """Estimate the share of the variance of each axis alone; whole numbers have cells of equal size."""
     distributions = {}
     for axis in axes:
         low, high = axis.bounds
@@ -154,7 +155,7 @@ def _f_anova(
 def _ped_anova(
     axes: Sequence[Axis], points: NDArray[np.float64], targets: NDArray[np.float64], best_share: float
 ) -> NDArray[np.float64]:
-    """Divergence of the best trials' distribution from all trials', by axis, as shares of the sum."""
+    """Compute how far the best trials' distribution diverges from that of all trials along each axis, in shares."""
     if np.sort(targets)[math.ceil(best_share * len(targets)) - 1] == targets.max():  # ties make all trials the best
         return np.zeros(len(axes))
     distributions = {}

@@ -1,8 +1,8 @@
-"""Refinement: a narrower space from the records of earlier stages, and the evidence for every change.
+"""Refinement narrows a search space by the records of earlier stages, and gives the evidence for every change.
 
-A value of a choice, or what lies beyond an end of a range, goes only if at most a tenth of the best trials use it and
-chance alone would hardly have let so few through: without influence, the number of the best trials that use it is
-hypergeometric. The baseline and the best trial always stay in.
+A value of a choice, or a part of a range beyond the best trials, is removed only if at most a tenth of the best trials
+use it and so few are significant: if the value had no influence, the number of the best trials that use it would follow
+a hypergeometric distribution. The values of the baseline and of the best trial are always kept.
 """
 
 import math
@@ -22,8 +22,8 @@ from cconv.study.records.trials import TrialRecord, identity
 
 MIN_TRIALS = 20
 TOP_SHARE = 0.25
-SPARED_SHARE = 0.1  # of the best trials, as many may use what is given up
-SIGNIFICANCE = 0.01  # chance to give up what has no influence
+SPARED_SHARE = 0.1  # of the best trials; as many may use a value that is removed
+SIGNIFICANCE = 0.01  # probability of removing a value that has no influence
 MARGIN = 0.1  # of the range, beyond the best trials
 
 
@@ -32,12 +32,12 @@ Drawn = TypeVar("Drawn", bound=Value)
 
 @dataclass(frozen=True)
 class _Evidence(Generic[Drawn]):
-    """Trials in which a parameter is active.
+    """Values of a parameter in the trials in which it is active.
 
     Attributes:
         values: Value of each trial.
-        top: Value of each of the best, the very best first.
-        where: At which budget they were compared, in words.
+        top: Value of each of the best trials, the best one first.
+        where: The budget at which they were compared, in words.
     """
 
     values: list[Drawn]
@@ -46,17 +46,17 @@ class _Evidence(Generic[Drawn]):
 
     @property
     def spared(self) -> int:
-        """How many of the best may use what is given up."""
+        """Number of the best trials that may use a value that is removed."""
         return int(SPARED_SHARE * len(self.top))
 
     def is_unwanted(self, condition: Callable[[Drawn], bool]) -> bool:
-        """Whether the best hardly ever have such a value, though it was drawn often."""
+        """Tell whether significantly few of the best trials have a value that meets a condition."""
         drawn, used = (sum(map(condition, values)) for values in (self.values, self.top))
         chance = hypergeom.cdf(used, len(self.values), drawn, len(self.top))
         return used <= self.spared and bool(chance <= SIGNIFICANCE)
 
     def use_of(self, value: Drawn) -> str:
-        """How often a value was drawn, in words."""
+        """Say how often a value was drawn."""
         return f"{value!r} ({self.top.count(value)} of the best, {self.values.count(value)} of all)"
 
     def __str__(self) -> str:
@@ -64,11 +64,11 @@ class _Evidence(Generic[Drawn]):
 
 
 def refine(space: SearchSpace, records: Sequence[TrialRecord], full_updates: int) -> tuple[SearchSpace, dict[str, str]]:
-    """The space without what the best trials leave unused, and a reason for each of its parameters.
+    """Remove the values that the best trials do not use from a space, and give a reason for each parameter.
 
-    The best are a quarter of all trials, compared at the largest budget that so many reached; none are judged by fewer
-    than `MIN_TRIALS`. A conditional parameter is judged by the trials in which it is active. Several trainings of one
-    configuration count once.
+    The best are a quarter of all trials, compared at the largest budget that so many reached. A parameter stays as it
+    is with fewer than `MIN_TRIALS` trials. For a conditional parameter only the trials in which it is active count.
+    Several trainings of one configuration count once.
 
     Args:
         space: The space that the trials were drawn from.
@@ -76,7 +76,7 @@ def refine(space: SearchSpace, records: Sequence[TrialRecord], full_updates: int
         full_updates: Budget of a trial that was never stopped.
 
     Returns:
-        The refined space, and what was decided about each parameter of the old one, in words.
+        The narrowed space, and the decision about each parameter of the old one, in words.
     """
     trained = _distinct([record for record in records if _counts(record)])
     domains, reasons = {}, {}
@@ -84,7 +84,7 @@ def refine(space: SearchSpace, records: Sequence[TrialRecord], full_updates: int
         domains[name], reasons[name] = _refined(name, parameter, trained, full_updates)
     refined = narrowed(space, domains)
     for name in space.parameters.keys() - refined.parameters.keys():
-        reasons[name] = f"left out: nothing that is left of {' and '.join(space.parameters[name].when)} makes it active"
+        reasons[name] = f"left out: no remaining value of {' and '.join(space.parameters[name].when)} makes it active"
     parameters = {
         name: parameter.model_copy(
             update={"reason": f"{parameter.reason} {reasons[name][0].upper()}{reasons[name][1:]}."}
@@ -109,7 +109,7 @@ def _counts(record: TrialRecord) -> bool:
 
 
 def _distinct(records: Sequence[TrialRecord]) -> list[TrialRecord]:
-    """The first training of each configuration."""
+    """Keep the first training of each configuration."""
     first: dict[str, TrialRecord] = {}
     for record in records:
         first.setdefault(identity(record.parameters), record)
@@ -122,14 +122,14 @@ def _refined(
     active = [record for record in records if name in record.parameters and parameter.holds(record.parameters[name])]
     evidence = _evidence(name, active, full_updates)
     if evidence is None:
-        return parameter, f"kept: too few trials, {len(active)} of the {MIN_TRIALS} that it takes"
+        return parameter, f"kept: too few trials, {len(active)} of the {MIN_TRIALS} that are needed"
     if isinstance(parameter, Choice):
         return _narrow_choice(parameter, evidence)
-    return _narrow_range(parameter, cast(_Evidence[float], evidence))  # a range holds numbers only
+    return _narrow_range(parameter, cast(_Evidence[float], evidence))  # a range has numbers only
 
 
 def _evidence(name: str, records: Sequence[TrialRecord], full_updates: int) -> _Evidence[Value] | None:
-    """The best quarter of all at the largest budget that so many reached; None if there are too few trials."""
+    """Compare trials at the largest budget that a quarter of them reached; None if there are too few trials."""
     values = [record.parameters[name] for record in records]
     trials = list(zip(map(_errors_by_updates, records), values, strict=True))
     count = math.ceil(TOP_SHARE * max(len(trials), MIN_TRIALS))
@@ -146,6 +146,7 @@ def _errors_by_updates(record: TrialRecord) -> Mapping[int, float]:
 
 
 def _narrow_choice(parameter: Choice, evidence: _Evidence[Value]) -> tuple[Choice, str]:
+    """Return a choice without its unwanted values, and the reason."""
     unwanted = [value for value in parameter.values if evidence.is_unwanted(partial(eq, value))]
     kept = [
         value for value in parameter.values if value not in unwanted or value in _held(parameter.baseline, evidence)
@@ -159,6 +160,7 @@ def _narrow_choice(parameter: Choice, evidence: _Evidence[Value]) -> tuple[Choic
 
 
 def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence[float]) -> tuple[IntRange | FloatRange, str]:
+    """Return a range without its unwanted ends, and the reason."""
     ordered = sorted(evidence.top)
     lowest, highest = ordered[evidence.spared], ordered[-1 - evidence.spared]
     low, high = _with_margin(parameter, lowest, highest)
@@ -181,12 +183,12 @@ def _narrow_range(parameter: IntRange | FloatRange, evidence: _Evidence[float]) 
 
 
 def _held(baseline: Drawn, evidence: _Evidence[Drawn]) -> tuple[Drawn, Drawn]:
-    """Values that stay whatever the evidence says."""
+    """Return the values that are always kept: those of the baseline and of the best trial."""
     return baseline, evidence.top[0]
 
 
 def _with_margin(parameter: IntRange | FloatRange, lowest: float, highest: float) -> tuple[float, float]:
-    """An interval with a margin on the parameter's scale, rounded outwards to whole numbers or three digits."""
+    """Widen an interval by a margin on the parameter's scale; round it out to whole numbers, or to three digits."""
     log = parameter.scale == "log"
     ends = [math.log(end) if log else float(end) for end in (*parameter.range, lowest, highest)]
     margin = MARGIN * (ends[1] - ends[0])

@@ -1,4 +1,4 @@
-"""How the error depends on one hyperparameter, by a surrogate, beside the trials that it was fitted to."""
+"""Partial dependence of the error on one hyperparameter by a surrogate, with the trials that it was fitted to."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,7 @@ def partial_dependence(
     useless_error: float,
     seed: int = 0,
 ) -> PartialDependence:
-    """How the error depends on one hyperparameter when the others are as in the trials, by a random forest.
+    """Estimate by a random forest how the error depends on one hyperparameter while the others are as in the trials.
 
     Source: Friedman, "Greedy Function Approximation", Ann. Statist. 29 (2001), section 8.2, on log10 error.
 
@@ -38,15 +38,16 @@ def partial_dependence(
         space: The space that they were drawn from.
         updates: Number of gradient updates of the errors.
         parameter: The hyperparameter.
-        useless_error: Error up to which errors count, as in `cconv.study.evidence.importance`.
-        seed: Of the forest.
+        useless_error: Largest error; larger ones are replaced by it, as in `cconv.study.evidence.importance`.
+        seed: Seed of the forest.
 
     Returns:
-        The mean error at values of the hyperparameter, with the middle 80 % of the forest's trees, which is no
-        confidence interval, and the raw trials.
+        The mean error at values of the hyperparameter, the range of the middle 80 % of the forest's trees, which is no
+        confidence interval, and the values and errors of the trials.
 
     Raises:
-        ConfigError: If the space does not vary the hyperparameter, or fewer than ten trials have these updates.
+        ConfigError: If the space does not vary the hyperparameter, or fewer than ten trials have an error after these
+            updates.
     """
     axes = axes_of(space)
     names = [axis.name for axis in axes]
@@ -54,7 +55,9 @@ def partial_dependence(
     if parameter not in names:
         raise ConfigError(f"`{parameter}` does not vary in the space; those that do: {', '.join(names)}.")
     if len(trials) < FEWEST_TRIALS:
-        raise ConfigError(f"{len(trials)} trials have {updates} updates; a surrogate needs {FEWEST_TRIALS}.")
+        raise ConfigError(
+            f"{len(trials)} trials have an error after {updates} updates; a surrogate needs {FEWEST_TRIALS}."
+        )
     number, points = names.index(parameter), coordinates(axes, [trial.parameters for trial in trials])
     axis = axes[number]
     grid = _grid(axis)
@@ -92,7 +95,7 @@ def _grid(axis: Axis, steps: int = 25) -> NDArray[np.float64]:
 def _means_by_tree(
     surrogate: Surrogate, points: NDArray[np.float64], number: int, grid: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mean prediction (trees, values) with one coordinate of all points at each value of the grid."""
+    """Compute the mean prediction (trees, values) with one coordinate of all points set to each value of the grid."""
     moved = np.repeat(points[None], len(grid), axis=0)
     moved[:, :, number] = grid[:, None]
     predictions = surrogate.predict_by_tree(moved.reshape(-1, points.shape[1]))

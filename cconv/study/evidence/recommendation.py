@@ -1,4 +1,4 @@
-"""Which models to look at closer, and which one to recommend: no more than the scene needs."""
+"""The choice of the finalists, and of the model to recommend: the fastest that is accurate and stable enough."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ RULES = ("one_standard_error", "non_inferiority", "accurate_enough")
 def choose_finalists(
     records: Sequence[TrialRecord], cost: Mapping[str, float], count: int, accurate_enough: float | None = None
 ) -> list[TrialRecord]:
-    """Configurations among those that none is both more accurate and cheaper than, most accurate first.
+    """Choose configurations on the Pareto front of validation error and cost, most accurate first.
 
-    The `count` most accurate ones; or, where more of them are accurate enough, `count` evenly spaced from the most
+    They are the `count` most accurate ones; or, if more are accurate enough, `count` evenly spaced ones from the most
     accurate to the cheapest of those. Only trials of the full budget compete, by their last validation error.
 
     Args:
@@ -51,19 +51,19 @@ def choose_finalists(
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """A model beside the best one, by validation errors.
+    """A model compared with the best one by validation errors.
 
     Attributes:
-        id: Its name.
+        id: Name of the model.
         error: Mean validation error over seeds and units.
-        time: ms per frame, by turns.
-        to_best: Its errors by those of the best model, on the same seeds and units.
-        within_one_se: Whether the logarithm of that ratio is at most its standard error, and that of the best's error.
-        non_inferior: Whether the upper end of the ratio's interval is at most 1 + the margin; False without interval.
-        accurate_enough: Whether the error is at most the study's limit; False without one.
-        failures: Checks of stability that it failed.
-        eligible: Whether it may be recommended, by any rule.
-        why_not: Why it may not, or "".
+        time: Time of each turn, ms per frame.
+        to_best: Ratio of its errors to those of the best model on the same seeds and units.
+        within_one_se: True if the logarithm of that ratio is at most its standard error and that of the best error.
+        non_inferior: True if the upper end of the interval of the ratio is at most 1 + the margin; False without one.
+        accurate_enough: True if the error is at most the limit of the study; False without a limit.
+        failures: Checks of stability that the model failed.
+        eligible: True if it may be recommended.
+        why_not: The reason why it may not be recommended, or "".
     """
 
     id: str
@@ -79,27 +79,27 @@ class Comparison:
 
     @property
     def stable(self) -> bool:
-        """Whether it passed every check of stability."""
+        """True if the model passed every check of stability."""
         return not self.failures
 
     def passes(self, rule: str) -> bool:
-        """Whether it is as good as the best by one of `RULES`."""
+        """Tell whether it is as good as the best model by one of `RULES`."""
         by_rule = (self.within_one_se, self.non_inferior, self.accurate_enough)
         return dict(zip(RULES, by_rule, strict=True))[rule]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recommendation:
-    """The model to use, and why.
+    """The recommended model and the reason for it.
 
     Attributes:
         id: The recommended model.
         reason: The reason in words.
-        best: The model of the smallest validation error, of those chosen from.
-        tied: Models that are as fast as the fastest eligible one within the noise of the timing, that one included;
-            of these, the recommended one has the smallest validation error.
-        by_rule: The model that each of `RULES` alone would choose, None where it chooses none.
-        comparisons: Every model beside the best, fastest first.
+        best: The most accurate of the stable models on the validation split, or of all if none is stable.
+        tied: Eligible models that are as fast as the fastest one within the noise of the timing, including that one; of
+            these, the recommended one has the smallest validation error.
+        by_rule: The model that each of `RULES` alone would choose; None if it chooses none.
+        comparisons: Every model compared with the best, fastest first.
     """
 
     id: str
@@ -118,26 +118,28 @@ def recommend(
     accurate_enough: float | None = None,
     margin: float = 0.05,
 ) -> Recommendation:
-    """The fastest stable model that is as accurate as the best one, or accurate enough; ties go to the smaller error.
+    """Choose the fastest stable model that is as accurate as the best one, or accurate enough.
 
-    It takes validation errors: the error of a model that was chosen by its luck on some units is too small on those
-    very units, so that the test split is for reporting what was chosen. The search for finalists and the choice of each
-    checkpoint went by validation errors as well; for that reason, too, they are never what is reported.
+    The choice uses validation errors. The error of a model on the units that it was chosen by is biased: it is too
+    small on average, because the model was chosen for being good on these units. So the test split is kept for
+    reporting the error of the chosen model. The validation errors also chose the finalists and the checkpoints, which
+    is one more reason not to report them.
 
-    As accurate is within one standard error of the best, or not inferior: the upper end of the 95 % interval of the
-    ratio of errors is within the margin. The standard error is that of the ratio or that of the best model's own error,
-    whichever is smaller: a model of which one seed failed would pass for its scatter alone. The best is the most
-    accurate of the stable models; if none is stable, all are chosen from, and the reason says so. Models whose times
-    differ by no more than the noise of the timing are ties.
+    A model is as accurate as the best one if it is within one standard error of it or not inferior, that is, if the
+    upper end of the 95 % interval of the ratio of errors is within the margin. The standard error is that of the ratio
+    or that of the best model's own error, whichever is smaller; otherwise a model with one bad seed would pass because
+    of its own large variance. The best model is the most accurate of the stable ones. If none is stable, the choice is
+    among all, and the reason says so. Models whose times differ by no more than the noise of the timing are ties; the
+    one with the smallest error is chosen.
 
     Sources: the one-standard-error rule of Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3;
     Chen and Yang, "The One Standard Error Rule for Model Selection: Does It Work?", Stats 4 (2021).
 
     Args:
-        errors: Validation errors (seeds, units) by model, one row where no seed is drawn; seeds and units are the same.
-        times: ms per frame, by model.
-        failures: Checks of stability that each model failed; those that failed none may be left out.
-        accurate_enough: Error up to which models count as equally accurate; None for no such limit.
+        errors: Validation errors (seeds, units) by model on the same seeds and units; one row for a closed form.
+        times: Time of each model.
+        failures: Checks of stability that each model failed; models that passed all may be left out.
+        accurate_enough: Error up to which all models are accurate enough; None for no such limit.
         margin: Margin of non-inferiority, as a share of the best error.
 
     Raises:
@@ -171,16 +173,17 @@ def recommend(
 def retrained_error(
     valid: Mapping[str, np.ndarray], test: Mapping[str, np.ndarray], choose: Callable[[Mapping], str]
 ) -> ExpectedError | None:
-    """Error to expect of the chosen model if it is trained again with other seeds than those that it was chosen by.
+    """Estimate the error of the chosen model if it is trained again with other seeds than those that it was chosen by.
 
-    Validation and test errors of a model share its trained networks: their mean test error is fair to these networks,
-    but if seeds vary much and models little, the chosen one is the one with the lucky seeds. So each seed in turn is
-    left out, a model chosen by the validation errors of the others, and its test error taken with the seed left out.
+    Validation and test errors of a model come from the same trained networks. The mean test error is unbiased for these
+    networks. But if errors vary more over seeds than over models, the choice prefers models whose seeds happened to be
+    good. So each seed in turn is left out: a model is chosen by the validation errors of the other seeds, and its test
+    error is taken with the seed that was left out.
 
     Args:
-        valid: Validation errors (seeds, units) by model, one row where no seed is drawn.
+        valid: Validation errors (seeds, units) by model; one row for a closed form.
         test: Test errors, likewise.
-        choose: Validation errors to the name of the chosen model.
+        choose: Function from validation errors to the name of the chosen model.
 
     Returns:
         The mean error over the seeds, and how often each model was chosen; None without several seeds.
@@ -201,7 +204,7 @@ def retrained_error(
 
 
 def _best(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], failures: Mapping) -> str:
-    """The most accurate of the stable models, or of all if none is stable."""
+    """Return the most accurate of the stable models, or of all if none is stable."""
     stable = [name for name in errors if not failures.get(name)]
     return min(stable or errors, key=lambda name: (float(np.mean(errors[name])), times[name].ms))
 
@@ -213,7 +216,7 @@ def _comparisons(
     accurate_enough: float | None,
     margin: float,
 ) -> tuple[Comparison, ...]:
-    """Every model beside the best, fastest first."""
+    """Compare every model with the best, fastest first."""
     best = _best(errors, times, failures)
     own_se = crossed_standard_error(paired_logarithms([errors[best]])[0])[0]
     none_stable = bool(failures.get(best))
@@ -244,12 +247,12 @@ def _comparisons(
 
 
 def _as_fast_as_the_first(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """Those of some models, fastest first, that are not slower than the first beyond the noise of the timing."""
+    """Return the models that are not slower than the first one, the fastest, beyond the noise of the timing."""
     return [each for each in comparisons if not each.time.is_slower(comparisons[0].time)]
 
 
 def _fastest_by(rule: str, eligible: Sequence[Comparison]) -> str | None:
-    """What a rule alone would choose."""
+    """Return the model that a rule alone would choose."""
     passing = [each for each in eligible if each.passes(rule)]
     return min(_as_fast_as_the_first(passing), key=lambda each: each.error).id if passing else None
 
@@ -300,8 +303,8 @@ def _tie(chosen: Comparison, tied: Sequence[Comparison]) -> str:
     if not others:
         return ""
     return (
-        f"The timing cannot tell {chosen.id} from {', '.join(others)} (now one is faster, now the "
-        "other); of these, it has the smallest validation error."
+        f"Within the noise of the timing {chosen.id} is as fast as {', '.join(others)}; of these, it has the smallest "
+        "validation error."
     )
 
 
@@ -311,7 +314,7 @@ def _why_no_interval(errors: Mapping[str, np.ndarray]) -> str:
 
 def _rules(chosen: Comparison, by_rule: Mapping[str, str | None], margin: float, why_not: str) -> str:
     if why_not:
-        return f"Whether others are not inferior cannot be told: {why_not}."
+        return f"Non-inferiority cannot be tested: {why_not}."
     one_se, non_inferior = by_rule["one_standard_error"], by_rule["non_inferiority"]
     names = f"one standard error and non-inferiority (margin {100 * margin:g} %)"
     if one_se == non_inferior:

@@ -1,4 +1,4 @@
-"""Whether the order of trials at a rung foretells their order at the full budget, from trials that nothing stopped."""
+"""The audit of the rungs: how well the order of trials at a rung predicts their order at the full budget."""
 
 import math
 from collections.abc import Sequence
@@ -20,22 +20,22 @@ MEASURES = ("spearman", "kendall", "crossing_rate", "recall", "survival", "regre
 def audit_rungs(
     records: Sequence[TrialRecord], rungs: Sequence[int], *, top: float = 0.1, kept: float = 1 / 3
 ) -> list[RungAudit]:
-    """How well the order of trials at a rung foretells their order at the full budget.
+    """Measure how well the order of trials at each rung predicts their order at the full budget.
 
-    A trial that diverged has no error at the full budget and takes no part.
+    A trial that diverged has no error at the full budget and is left out.
 
     Args:
-        records: Trials that nothing stopped.
+        records: Trials without early stopping.
         rungs: Updates of the rungs below the full budget.
         top: Share of the trials that count as the best at the full budget; at least three count.
-        kept: Share of the trials that goes on from a rung: ASHA's 1 / reduction factor.
+        kept: Share of the trials that continue beyond a rung: ASHA's 1 / reduction factor.
 
     Returns:
         One entry a rung, with the measures of `rung_measures`, None below four trials, and the 95 % interval of
-        Spearman's correlation. The verdict is "undecided" without an interval; "unreliable" if the
-        correlation falls short of 0.6 or the survival of two thirds; "reliable" if the survival does not and the whole
-        interval lies above 0.6; else "undecided". The other measures have no interval: of those that were tried none
-        holds the true value often enough.
+        Spearman's correlation. The verdict is "undecided" without an interval. It is "unreliable" if the correlation is
+        below 0.6 or the survival below two thirds, "reliable" if the whole interval lies above 0.6, and else
+        "undecided". The other measures have no interval, because none that was tried covers the true value often
+        enough.
     """
     return [_audit(records, updates, top=top, kept=kept) for updates in rungs]
 
@@ -67,11 +67,12 @@ def _why_no_interval(trials: int) -> str:
 
 
 def spearman_interval(correlation: float, trials: int) -> list[float] | None:
-    r"""95 % interval of Spearman's correlation; None below twelve trials, where the verdict would rest on too few.
+    r"""Compute the 95 % interval of Spearman's correlation; None below twelve trials, too few for a verdict.
 
     It is Fisher's z plus and minus 1.96 standard errors :math:`\sqrt{(1 + r^2 / 2) / (n - 3)}`. A correlation of 1
-    counts as half a swap of neighbours less, so that it has an interval too. Source: Bonett and Wright, "Sample size
-    requirements for estimating Pearson, Kendall and Spearman correlations", Psychometrika 65 (2000).
+    is lowered by half of what a swap of two neighbours would lower it, so that it has an interval too. Source: Bonett
+    and Wright, "Sample size requirements for estimating Pearson, Kendall and Spearman correlations", Psychometrika 65
+    (2000).
     """
     if trials < FEWEST_FOR_INTERVAL:
         return None
@@ -88,19 +89,19 @@ def _errors_at_both(records: Sequence[TrialRecord], updates: int) -> tuple[np.nd
 
 
 def rung_measures(at_rung: np.ndarray, at_full: np.ndarray, *, top: int, kept: int) -> dict[str, float | None]:
-    """Agreement of the errors of the same trials at a rung and at the full budget.
+    """Measure how well the errors of the same trials at a rung and at the full budget agree.
 
     Args:
         at_rung: Errors at the rung, (trials,).
         at_full: Errors at the full budget, (trials,).
         top: Number of trials that count as the best.
-        kept: Number of trials that go on from the rung.
+        kept: Number of trials that continue beyond the rung.
 
     Returns:
         "spearman" and "kendall", the rank correlations, None where all errors are equal; "crossing_rate", the share of
-        pairs of trials, ties aside, whose order turns; "recall", the share of the `top` at the full budget among the
-        `top` at the rung; "survival", their share among the `kept`; "regret", the full error of the rung's best divided
-        by the best full error.
+        pairs of trials without a tie whose order changes; "recall", the share of the `top` at the full budget that are
+        among the `top` at the rung; "survival", the share that are among the `kept`; "regret", the error at the full
+        budget of the best trial at the rung, divided by the smallest error at the full budget.
     """
     by_rung, by_full = np.argsort(at_rung, kind="stable"), np.argsort(at_full, kind="stable")
     best = by_full[:top]

@@ -1,4 +1,4 @@
-"""How much of the spread among configurations is due to the initial weights (thesis, section 4.1)."""
+"""The seed variance: how much of the spread among configurations the initial weights cause (thesis, section 4.1)."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import scipy.stats
 from cconv.study.records.found import SeedVariance
 from cconv.study.records.trials import TrialRecord
 
-FEWEST_VALUES = 8  # below, intervals of a share of variances cover 98 % and more, or far less if values are skewed
+FEWEST_VALUES = 8  # with fewer, intervals of a ratio of variances cover 98 % and more, or far less if values are skewed
 
 
 def variance_decomposition(
@@ -20,19 +20,19 @@ def variance_decomposition(
     resamples: int = 4999,
     seed: int = 0,
 ) -> list[SeedVariance]:
-    """Spread over seeds of one configuration beside the spread over configurations with one seed, at each rung.
+    """Compare the variance over seeds of one configuration with that over configurations with one seed, at each rung.
 
     Args:
         seed_records: Trials of one configuration that differ in the seed of the initial weights.
-        configuration_records: Trials that share that seed and differ in configuration; those that were stopped before
-            a rung do not count there, so that from the second rung on the spread is that of the survivors.
+        configuration_records: Trials with one seed that differ in the configuration. Those that were stopped before a
+            rung do not count there, so that from the second rung on the variance is that of the remaining ones.
         rungs: Updates at which both were measured.
         resamples: Bootstrap resamples.
         seed: Seed of the resampling.
 
     Returns:
-        One entry a rung; the variance over configurations holds that over seeds. The interval of their ratio is None
-        below `FEWEST_VALUES` of either. A rung that fewer than two of either reached has no entry.
+        One entry a rung; the variance over configurations includes that over seeds. The interval of their ratio is None
+        with fewer than `FEWEST_VALUES` of either. A rung that fewer than two of either reached has no entry.
     """
     entries = []
     for updates in rungs:
@@ -48,11 +48,11 @@ def variance_decomposition(
 def compare_variances(
     over_seeds: np.ndarray, over_configurations: np.ndarray, *, resamples: int = 4999, seed: int = 0
 ) -> dict:
-    """Spreads of two samples of log10 errors, and the share of their variances with its interval.
+    """Compute the standard deviations of two samples of log10 errors, and the ratio of the variances with an interval.
 
-    A few configurations that hardly learn make the logarithms skewed; intervals by the F-distribution then hold the
-    true share in 87 to 90 % of simulated cases. This one is the logarithm of the share plus and minus its bootstrap
-    standard error times the quantile of t, with the degrees of freedom of the smaller sample.
+    A few configurations that hardly learn make the logarithms skewed; intervals by the F-distribution then cover the
+    true ratio in 87 to 90 % of simulated cases. This one is the logarithm of the ratio plus and minus its bootstrap
+    standard error times the quantile of Student's t, with the degrees of freedom of the smaller sample.
     """
     of_seeds, of_configurations = np.var(over_seeds, ddof=1), np.var(over_configurations, ddof=1)
     share = float(of_seeds / of_configurations) if of_configurations > 0 else None

@@ -1,4 +1,4 @@
-"""What a search spent, and what other strategies would have found, replayed on the curves of trials nothing stopped."""
+"""Cost and result of a search, and of other stopping rules replayed on trials without early stopping."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ Curve = Sequence[tuple[int, float]]
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Outcome of a strategy.
+    """Outcome of a stopping rule.
 
     Attributes:
-        updates: Updates spent on all trials.
+        updates: Gradient updates spent on all trials.
         best_error: Smallest error at the full budget among the trials that reached it.
     """
 
@@ -26,17 +26,17 @@ class Replay:
 
 
 def spent_updates(records: Sequence[TrialRecord], full_updates: int) -> SpentUpdates:
-    """Updates that one or more trials of any outcome spent, and what they would have spent had none been stopped."""
+    """Count the updates of one or more trials, and the updates that they would have spent without early stopping."""
     spent = sum(record.log[-1]["updates"] for record in records if record.log)
     full = len(records) * full_updates
     return SpentUpdates(updates=spent, full_updates=full, share=spent / full)
 
 
 def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
-    """(cumulative updates, smallest error of a completed trial) after each trial, from the first completed one on.
+    """List (cumulative updates, smallest error of a completed trial) after each trial, from the first completed one on.
 
     Args:
-        records: Trials in the order in which they were drawn; trials that ran at the same time count one by one.
+        records: Trials in the order in which they were drawn; trials that ran at the same time count one after another.
     """
     curve: list[tuple[int, float]] = []
     spent, best = 0, float("inf")
@@ -50,7 +50,7 @@ def best_so_far(records: Sequence[TrialRecord]) -> list[tuple[int, float]]:
 
 
 def learning_curves(records: Sequence[TrialRecord]) -> dict[str, list[tuple[int, float]]]:
-    """(updates, validation error) at each evaluation of every completed trial whose errors are all finite, by id."""
+    """List (updates, validation error) of each evaluation by the id of every completed trial with finite errors."""
     curves = {
         record.id: [(entry["updates"], entry["valid_error"]) for entry in record.log]
         for record in records
@@ -62,13 +62,13 @@ def learning_curves(records: Sequence[TrialRecord]) -> dict[str, list[tuple[int,
 def replay_asha(
     curves: Mapping[str, Curve], rungs: Sequence[int], reduction_factor: int, order: Sequence[str]
 ) -> Replay:
-    """ASHA with one worker, which takes the trials in a given order.
+    """Replay ASHA with one worker, which takes the trials in a given order.
 
     Args:
         curves: Learning curves up to the full budget, by trial; the rungs are among their evaluations.
         rungs: Updates of the rungs; the last one is the full budget.
-        reduction_factor: A trial goes on if it is within the best 1 / `reduction_factor` of those before it.
-        order: Names of the trials; a name may come again, as another trial.
+        reduction_factor: A trial continues if it is within the best 1 / `reduction_factor` of those before it.
+        order: Names of the trials; a repeated name is another trial.
     """
     table = RungTable(rungs, reduction_factor)
     spent, finished = 0, []
@@ -82,7 +82,7 @@ def replay_asha(
 
 
 def replay_little_each(curves: Mapping[str, Curve], updates_each: int, keep: int, trials: Sequence[str] = ()) -> Replay:
-    """Train every trial a little, then the best few to the full budget.
+    """Replay the rule that trains every trial a little, then the best few to the full budget.
 
     Source: Egele et al., "The unreasonable effectiveness of early discarding after one epoch in neural network
     hyperparameter optimization", Neurocomputing (2024).
@@ -90,8 +90,8 @@ def replay_little_each(curves: Mapping[str, Curve], updates_each: int, keep: int
     Args:
         curves: Learning curves up to the full budget, by trial.
         updates_each: Updates after which trials are compared, an evaluation of every curve.
-        keep: Number of trials that go on.
-        trials: Names of the trials, where a name may come again; by default each once.
+        keep: Number of trials that continue.
+        trials: Names of the trials, which may be repeated; by default each once.
     """
     chosen = [curves[trial] for trial in trials or curves]
     ranked = sorted(chosen, key=lambda curve: dict(curve)[updates_each])
@@ -102,22 +102,22 @@ def replay_little_each(curves: Mapping[str, Curve], updates_each: int, keep: int
 def compare_strategies(
     curves: Mapping[str, Curve], rungs: Sequence[int], reduction_factor: int, *, draws: int = 200, seed: int = 0
 ) -> list[ReplayedStrategy]:
-    """ASHA, a little of each at every rung for the same updates, and no stopping, on redrawn trials in random order.
+    """Replay ASHA, training all trials a little and the best to the end, and no stopping, on trials that are redrawn.
 
-    Each draw takes as many trials as there are, with replacement, so that the spread holds both the variance of the
-    order and that of the configurations. A little of each keeps as many trials as ASHA's mean updates pay for, at
-    least one.
+    Each draw takes as many trials as there are, with replacement and in random order, so that the range includes the
+    variance of the order and of the configurations. The second rule is replayed for each rung below the full budget; it
+    keeps as many trials as the mean updates of ASHA pay for, at least one.
 
     Args:
         curves: Learning curves up to the full budget, by trial.
         rungs: Updates of the rungs; the last one is the full budget.
-        reduction_factor: ASHA's.
+        reduction_factor: Reduction factor of ASHA.
         draws: Number of draws.
         seed: Seed of the draws.
 
     Returns:
-        One entry a strategy; the share is that of the mean updates, and the range holds the 2.5 and 97.5 percentiles.
-        Empty if no curve was measured at every rung; others do not count.
+        One entry a rule; the share is the mean over the draws, and the range is from the 2.5th to the 97.5th
+        percentile. Only curves that were measured at every rung count; without one the list is empty.
     """
     curves = {trial: curve for trial, curve in curves.items() if set(rungs) <= set(dict(curve))}
     if not curves:

@@ -1,4 +1,4 @@
-"""Trials of one stage at one number of updates, as numbers, and a random forest over them that predicts the error."""
+"""Trials at one number of updates as coordinates and targets, and a random forest that predicts the error from them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from cconv.study.declared.domains import Parameter, SearchSpace
 from cconv.study.records.trials import TrialRecord
 from cconv.validation import Value
 
-FEWEST_TRIALS = 10  # fewer say nothing of a dozen hyperparameters
+FEWEST_TRIALS = 10  # fewer show nothing about a dozen hyperparameters
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A hyperparameter as a coordinate along which the space draws evenly.
+    """A hyperparameter as a coordinate that the space draws uniformly.
 
     Attributes:
         name: Name of the hyperparameter.
         bounds: Smallest and largest coordinate.
         levels: Values of a choice, whose coordinates are their positions; None for a range.
-        is_ordered: Whether neighbouring coordinates are neighbouring values; not so for words.
+        is_ordered: Whether neighbouring coordinates are neighbouring values, which is not so for words.
         is_whole: Whether coordinates are whole numbers.
         is_log: Whether the coordinate is the decimal logarithm of the value.
-        baseline: Value that stands for none.
+        baseline: Value of a configuration without the hyperparameter.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Axis:
 
     @classmethod
     def of(cls, name: str, parameter: Parameter) -> "Axis":
-        """Axis of a hyperparameter of a space."""
+        """Make the axis of a hyperparameter of a space."""
         if parameter.type == "choice":
             ordered = not any(isinstance(value, str) for value in parameter.values)
             levels = tuple(sorted(parameter.values) if ordered else parameter.values)
@@ -50,7 +50,7 @@ class Axis:
         return cls(name, (float(low), float(high)), is_whole=whole, is_log=log, baseline=parameter.baseline)
 
     def encode(self, value: Value) -> float:
-        """Coordinate of a value.
+        """Return the coordinate of a value.
 
         Raises:
             DataError: If the space does not have the value.
@@ -66,20 +66,20 @@ class Axis:
         return coordinate
 
     def decode(self, coordinate: float) -> Value:
-        """Value at a coordinate."""
+        """Return the value at a coordinate."""
         if self.levels is not None:
             return self.levels[round(coordinate)]
         return int(coordinate) if self.is_whole else float(10**coordinate if self.is_log else coordinate)
 
 
 def axes_of(space: SearchSpace) -> list[Axis]:
-    """Axes of the hyperparameters that have more than one value, in the order of the space."""
+    """Make the axes of the hyperparameters that have more than one value, in the order of the space."""
     axes = [Axis.of(name, parameter) for name, parameter in space.parameters.items()]
     return [axis for axis in axes if axis.bounds[0] < axis.bounds[1]]
 
 
 def coordinates(axes: Sequence[Axis], parameters: Iterable[Mapping]) -> NDArray[np.float64]:
-    """Coordinates (M, P) of M configurations; a hyperparameter that is absent, as inactive, is at its baseline."""
+    """Return coordinates (M, P) of M configurations; a hyperparameter that is inactive has its baseline value."""
     rows = [[axis.encode(drawn.get(axis.name, axis.baseline)) for axis in axes] for drawn in parameters]
     return np.array(rows, dtype=np.float64).reshape(-1, len(axes))
 
@@ -87,18 +87,18 @@ def coordinates(axes: Sequence[Axis], parameters: Iterable[Mapping]) -> NDArray[
 def trials_at(
     records: Sequence[TrialRecord], updates: int, after: int = 0, *, useless_error: float
 ) -> tuple[list[TrialRecord], NDArray[np.float64]]:
-    """Trials with an error at exactly this number of updates, and log10 of those errors.
+    """Return the trials with an error at exactly this number of updates, and log10 of those errors.
 
-    A trial that diverged, or was given up with a useless error, on the way there, later than `after`, counts too.
-    Errors above the useless one, and those of such trials, count as that: how much worse than predicting the mean a
-    model is says nothing of good models, yet would make up most of the variance.
+    A trial that diverged or was given up with a useless error between `after` and these updates is included. Its error,
+    like every larger one, is replaced by the useless error: how much worse than predicting the mean a model is shows
+    nothing about good models, but would cause most of the variance.
 
     Args:
         records: The trials.
         updates: Number of gradient updates.
         after: Updates of the rung before.
-        useless_error: Error of predicting the mean on the validation split, which is 1 on the training split alone; or
-            the error at which trials are given up, if that is smaller.
+        useless_error: Error of predicting the mean on the validation split, or the error at which trials are given up,
+            if that is smaller.
     """
     errors = {record.id: _error_at(record, updates, after, useless_error) for record in records}
     measured = [record for record in records if errors[record.id] is not None]
@@ -116,12 +116,14 @@ def _error_at(record: TrialRecord, updates: int, after: int, useless_error: floa
 
 
 class Surrogate:
-    """A random forest over coordinates, where words are a column each. Source: Breiman, "Random Forests" (2001).
+    """A random forest over coordinates, in which every word of a choice is a column.
+
+    Source: Breiman, "Random Forests", Machine Learning 45 (2001).
 
     Args:
         axes: Axes of the coordinates.
         trees: Number of trees.
-        seed: Of their bootstrap samples.
+        seed: Seed of their bootstrap samples.
     """
 
     def __init__(self, axes: Sequence[Axis], *, trees: int = 64, seed: int = 0):
@@ -129,16 +131,16 @@ class Surrogate:
         self._forest = RandomForestRegressor(n_estimators=trees, random_state=seed)
 
     def fit(self, coordinates: NDArray[np.float64], targets: NDArray[np.float64]) -> "Surrogate":
-        """Fit targets (M,) at coordinates (M, P)."""
+        """Fit the forest to targets (M,) at coordinates (M, P)."""
         self._forest.fit(self._columns(coordinates), targets)
         return self
 
     def predict(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predictions (M,) at coordinates (M, P)."""
+        """Return predictions (M,) at coordinates (M, P)."""
         return self._forest.predict(self._columns(coordinates))
 
     def predict_by_tree(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predictions (trees, M) at coordinates (M, P)."""
+        """Return the predictions (trees, M) of the single trees at coordinates (M, P)."""
         columns = self._columns(coordinates)
         return np.stack([tree.predict(columns) for tree in self._forest.estimators_])
 
@@ -153,9 +155,9 @@ class Surrogate:
 def cross_validated_r2(
     axes: Sequence[Axis], coordinates: NDArray[np.float64], targets: NDArray[np.float64], *, seed: int
 ) -> float | None:
-    """R² of a surrogate on trials that it has not seen, by fivefold cross-validation; None where targets are all equal.
+    """Compute R² of a surrogate on unseen trials by fivefold cross-validation; None if all targets are equal.
 
-    It is at most 1; at 0 or below the surrogate predicts no better than the mean, and its importances mean nothing.
+    It is at most 1. If it is 0 or less, the surrogate is no better than the mean, and its importances mean nothing.
     """
     scatter = np.sum((targets - targets.mean()) ** 2)
     if scatter == 0:

@@ -1,1 +1,1 @@
-"""How a training happens: data, queue, pools, a trial."""
+"""Running trainings: the data, the queue of trainings, the pools that run them, and the training itself."""

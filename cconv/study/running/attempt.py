@@ -1,4 +1,4 @@
-"""One process's attempt at a training: it alone may write to the training's folder, and it is ended if it hangs."""
+"""Attempts at a training: one process at a time may write to the folder of a training, and it is ended if it hangs."""
 
 import faulthandler
 import uuid
@@ -10,22 +10,22 @@ from cconv.files import write_text
 
 
 class Superseded(CConvError):
-    """Another process has taken the training over."""
+    """The error that another process has taken the training over."""
 
 
 class Hanging(CConvError):
-    """An earlier attempt hung until its process was ended."""
+    """The error that an earlier attempt hung until its process was ended."""
 
 
 class Attempt:
-    """The right to write to a training's folder, and a watchdog over the process that has it.
+    """The right of a process to write to the folder of a training, and a watchdog that ends the process if it hangs.
 
-    A node that was thought dead may come back and find its training in other hands; what it would write then must not
-    reach the records. The attempt that was begun last has the right.
+    A node that was believed dead may come back while another process continues its training; it must not write to the
+    records any more. The attempt that began last has the right to write.
 
     Args:
         folder: Folder of the training.
-        seconds: Time after which the process is ended, whatever it does; where it hung stands in ``hanging.txt``.
+        seconds: Time after which the process is ended; ``hanging.txt`` then holds its stack trace.
     """
 
     def __init__(self, folder: Path, seconds: float):
@@ -55,13 +55,13 @@ class Attempt:
 
     @property
     def holds(self) -> bool:
-        """Whether no other attempt has taken the folder over."""
+        """True if no other attempt has taken the folder over."""
         try:
             return self._claim.read_text() == self._name
         except FileNotFoundError:
             return False
 
     def check(self) -> None:
-        """Raise `Superseded` unless the attempt still has the right to write."""
+        """Raise `Superseded` if another attempt has taken the folder over."""
         if not self.holds:
             raise Superseded(f"{self._claim.parent}: another process has taken this training over.")

@@ -1,4 +1,4 @@
-"""What configurations of a study cost: counted before anything is trained, and the time that follows from the count."""
+"""The cost of configurations: operations counted before any training, and the time that a cost model predicts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -14,15 +14,15 @@ from cconv.study.records.trials import TrialRecord
 from cconv.study.running.problem import Problem
 from cconv.tasks.features import WALLS, kinds_of
 
-FEWEST_MEASURED = 5  # models that a check of the cost model takes
+FEWEST_MEASURED = 5  # models, the fewest for a check of the cost model
 
 
 class CostCounter:
-    """Counts the cost of configurations in a study's scene, from the settings alone.
+    """A counter of the cost of configurations in the scene of a study, from the settings alone.
 
     Args:
-        study: Settings that configurations leave as they are.
-        problem: Scene and samples; points are counted around the particles of the first validation frame.
+        study: Study, with the settings that the configurations do not change.
+        problem: Scene and samples; neighbours are counted in the first validation frame.
     """
 
     def __init__(self, study: StudyConfig, problem: Problem):
@@ -31,10 +31,10 @@ class CostCounter:
         self._around = lru_cache(maxsize=4096)(self._count)
 
     def __call__(self, parameters: Mapping) -> CountedCost:
-        """Cost of one particle's prediction by a configuration.
+        """Count the cost of a prediction per particle by a configuration.
 
         Raises:
-            ConfigError: If its cutoff is more than the box allows.
+            ConfigError: If its cutoff is larger than the box allows.
         """
         features, network, _ = configure(parameters, self._study.configuration)
         return network.count(
@@ -52,15 +52,17 @@ class CostCounter:
 def points_of_search(
     count: CostCounter, records: Sequence[TrialRecord], measured: Mapping[str, Cost]
 ) -> tuple[list[SearchPoint], CostModel | None]:
-    """Error and time of every trial, the time by a cost model that is fitted to measured models and checked on them.
+    """Give every trial its error and time, which a cost model predicts if the trial was not timed.
+
+    The cost model is fitted to the timed models and checked on them.
 
     Args:
-        count: Counts configurations.
+        count: Counts the cost of a configuration.
         records: Trials and closed forms.
-        measured: Models that were timed in one run, by the id of the trial that found them.
+        measured: Cost of the models that were timed in one run, by the id of their trial.
 
     Returns:
-        A point of each trial with an error, and the cost model; none with fewer than five measured models.
+        A point for each trial with an error, and the cost model; no points and None with fewer than five timed models.
     """
     by_id = {record.id: record for record in records}
     known = {name: cost for name, cost in measured.items() if name in by_id}

@@ -1,23 +1,23 @@
-"""Who watches a study run."""
+"""The interface of observers, which are told about the trainings of a study as they run."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 
 class Observer(Protocol):
-    """Sees a study as it runs; the command line draws it."""
+    """An observer of a running study, e.g. the display of the command line."""
 
     def on_data(self, findings: Sequence[str]) -> None:
-        """The data were read; each line names something in them that does not make sense."""
+        """Take note that the data were read; each finding names something implausible in them."""
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
-        """A stage begins."""
+        """Take note that a stage begins."""
 
     def on_trial_start(self, trial: str, parameters: Mapping) -> None:
-        """A trial begins."""
+        """Take note that a trial begins."""
 
     def on_trial_result(self, trial: str, entry: Mapping) -> None:
-        """A trial was evaluated."""
+        """Take note of an evaluation of a trial."""
 
     def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
-        """A trial ended."""
+        """Take note that a trial ended."""

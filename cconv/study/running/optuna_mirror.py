@@ -1,7 +1,7 @@
-"""Our trials as an Optuna study, live, in a journal file or a database that Optuna's tools open.
+"""A copy of the trials as an Optuna study, live, in a journal file or a database that Optuna's tools can open.
 
-Nothing of ours reads it: the records are the truth. Only a trial of the full budget is COMPLETE; one that ended earlier
-is PRUNED with its errors at each evaluation, so that errors of different budgets are never compared as equals.
+No stage reads the copy; all results come from the records. Only a trial of the full budget is COMPLETE. One that ended
+earlier is PRUNED and has its errors at each evaluation, so that errors of different budgets are not compared.
 """
 
 import math
@@ -27,7 +27,7 @@ LOCK_FILE_SUFFIX = ".lock"
 
 
 def open_storage(journal: Path, url: str | None = None) -> BaseStorage:
-    """Optuna's storage: a journal file, or the database at `url`, e.g. ``postgresql+psycopg://user@host/studies``.
+    """Open Optuna's storage: a journal file, or the database at `url`, e.g. ``postgresql+psycopg://user@host/studies``.
 
     Raises:
         ConfigError: If the database cannot be reached or its driver is not installed.
@@ -54,10 +54,10 @@ def open_mirror(
     full_updates: int,
     records: Sequence[TrialRecord],
 ) -> "OptunaMirror":
-    """The mirror of a study in the database at `url`, or in a journal file that only this process writes.
+    """Open the mirror of a study in the database at `url`, or in a journal file that only this process writes.
 
-    A journal that is damaged or lacks trials is written anew from the records, and a lock that a killed process left
-    behind is removed.
+    A journal that is damaged or lacks trials is written again from the records, and the lock of a killed process is
+    removed.
 
     Args:
         journal: The journal file.
@@ -91,12 +91,12 @@ def open_mirror(
 def _readable_mirror(
     journal: Path, study_name: str, space: SearchSpace, full_updates: int, known: Iterable[str]
 ) -> "OptunaMirror | None":
-    """The mirror in a journal; None where it holds anything that Optuna did not write."""
+    """Open the mirror in a journal; None if the journal is damaged."""
     try:
         if journal.exists() and not journal.read_bytes().endswith(b"\n"):
             return None  # Optuna would append to half a line
         return OptunaMirror(open_storage(journal), study_name, space, full_updates, known)
-    except Exception:  # what garbage raises depends on what it looks like
+    except Exception:  # a damaged file can raise anything
         return None
 
 
@@ -110,10 +110,10 @@ def _delete(path: Path) -> None:
 
 @contextmanager
 def database_answers(url: str | None) -> Iterator[None]:
-    """Say in one line that the database at `url` went away.
+    """Turn the errors of a database that no longer answers into one clear line.
 
     Raises:
-        ConfigError: If Optuna says so inside.
+        ConfigError: If the database at `url` does not answer within the context.
     """
     try:
         yield
@@ -132,16 +132,17 @@ def _without_password(url: str) -> str:
 
 
 class OptunaMirror:
-    """An observer that repeats what it sees in an Optuna study.
+    """An observer that copies the trials to an Optuna study.
 
-    A trial that the storage holds already goes on there; one that it holds as running and that no record knows failed.
+    A trial that the storage has already is continued there. A running trial of the storage that has no record is marked
+    as failed.
 
     Args:
-        storage: Where the study is.
-        study_name: Its name.
-        space: Search space of all trials, refined ones included.
+        storage: Storage of the study.
+        study_name: Name of the study.
+        space: Search space of all trials, also of those from a narrowed space.
         full_updates: Full budget.
-        known: Names of the trials that are on record.
+        known: Ids of the trials with a record.
     """
 
     def __init__(
@@ -161,12 +162,12 @@ class OptunaMirror:
                 self._study.tell(trial.number, state=TrialState.FAIL)
 
     def lacks(self, names: Iterable[str]) -> bool:
-        """Whether any of the named trials is not in the storage."""
+        """Tell whether any of the named trials is not in the storage."""
         present = {trial.user_attrs.get("trial") for trial in self._study.get_trials(deepcopy=False)}
         return not set(names) <= present
 
     def replay(self, records: Iterable[TrialRecord]) -> None:
-        """Add trials as their records tell them; one that was cut short is left running, as it goes on."""
+        """Add trials from their records; an interrupted one stays running, because it will continue."""
         for record in records:
             self.on_trial_start(record.id, record.parameters)
             for entry in record.log:
@@ -175,15 +176,15 @@ class OptunaMirror:
                 self.on_trial_end(record.id, record.outcome, record.reason)
 
     def end_running(self) -> None:
-        """Tell FAIL for every trial that is still running, so that none is left so when a run ends early."""
+        """Mark every trial that is still running as FAIL, so that none stays running after a run that ended early."""
         for trial in self._study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
             self._study.tell(trial.number, state=TrialState.FAIL)
 
     def on_data(self, findings: Sequence[str]) -> None:
-        """Nothing: Optuna knows no data."""
+        """Do nothing: Optuna has no place for findings about the data."""
 
     def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
-        """Nothing: all searches share the study."""
+        """Do nothing: all searches share the study."""
 
     def on_trial_start(self, trial: str, parameters: Mapping) -> None:
         """Add a running trial."""
@@ -199,7 +200,7 @@ class OptunaMirror:
         self._numbers[trial] = len(self._study.get_trials(deepcopy=False)) - 1
 
     def on_trial_result(self, trial: str, entry: Mapping) -> None:
-        """Add the error of an evaluation; a huge one where the trial diverged, so that samplers keep away."""
+        """Add the error of an evaluation, or a huge one if the trial diverged, so that samplers avoid it."""
         frozen = self._frozen(trial)
         error = entry["valid_error"]
         value = DIVERGED_ERROR if entry["diverged"] or error is None else error
@@ -207,7 +208,7 @@ class OptunaMirror:
             Trial(self._study, frozen._trial_id).report(value, entry["updates"])
 
     def on_trial_end(self, trial: str, outcome: str, reason: str) -> None:
-        """COMPLETE with the last error at the full budget, PRUNED below it, FAIL without any error."""
+        """Mark the trial as COMPLETE at the full budget, as PRUNED below it, or as FAIL if it has no error."""
         frozen = self._frozen(trial)
         if frozen.state.is_finished():
             return

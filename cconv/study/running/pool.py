@@ -1,4 +1,4 @@
-"""What trains the jobs of a stage."""
+"""The interface of pools, which train the jobs of a stage."""
 
 from typing import Protocol
 
@@ -7,11 +7,11 @@ from cconv.study.running.trial_queue import TrialQueue
 
 
 class Pool(Protocol):
-    """Trains the jobs of queues, some at once or one after another."""
+    """A pool of processes, or a single process, that trains the jobs of queues."""
 
     def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
-        """Train every job of a queue that does not stop earlier to the full budget of `training`.
+        """Train every job of a queue to the full budget of `training`, unless it is stopped before.
 
         Raises:
-            ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
+            ConfigError: If the disk is full; the records stay, and the stage can be resumed.
         """

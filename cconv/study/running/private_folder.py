@@ -1,4 +1,4 @@
-"""Short folders for the files of a run's Ray, for its owner's eyes; known without Ray, as any run clears them away."""
+"""Private folders of short names for the files of Ray; also runs without Ray delete those of killed runs."""
 
 import fcntl
 import os
@@ -17,27 +17,27 @@ SESSION = "/ray/session_2026-01-01_00-00-00_000000_0000000/sockets/plasma_store"
 
 @contextmanager
 def private_folder() -> Iterator[Path]:
-    """A short folder for Ray's files and the token of this run, for its owner's eyes; it goes when the run ends.
+    """Make a folder of short name that only its owner can read, for Ray's files and token, and delete it in the end.
 
     Raises:
         ConfigError: If no folder for temporary files is short enough and can be written to.
     """
     with ExitStack() as stack:
         folder = _made_folder()
-        while not stack.enter_context(_locked(folder)):  # another run took it for left behind before it was locked
+        while not stack.enter_context(_locked(folder)):  # another run deleted it before it was locked
             folder = _made_folder()
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
         yield folder
 
 
 def remove_left_behind(folder: Path) -> None:
-    """Delete what killed runs left of Ray: its files of the run in `folder`, and private folders of the same user."""
+    """Delete the files of Ray that killed runs left: those of this run in `folder`, and this user's private folders."""
     shutil.rmtree(folder, ignore_errors=True)
     remove_private_folders()
 
 
 def remove_private_folders() -> None:
-    """Delete the private folders of runs that were killed: those of this user that no process has locked."""
+    """Delete the private folders of killed runs: those of this user that no process has locked."""
     for folder in (each for place in _places() for each in Path(place).glob(f"{PREFIX}????????")):
         try:
             if folder.is_symlink() or not folder.is_dir() or folder.stat().st_uid != os.getuid():
@@ -51,7 +51,7 @@ def remove_private_folders() -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[bool]:
-    """Hold a folder for this process alone, however that ends; False if another holds it or has deleted it."""
+    """Lock a folder; yield False if another process has locked or deleted it. A killed process loses its lock."""
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except FileNotFoundError:
@@ -72,7 +72,7 @@ def _lock(descriptor: int) -> bool:
 
 
 def _made_folder() -> Path:
-    """A folder of mode 0700 in the first place for temporary files where sockets of Ray have names short enough."""
+    """Make a folder of mode 0700 in the first place for temporary files in which paths of sockets are short enough."""
     reasons = []
     for place in _places():
         room = LONGEST_SOCKET - len(os.fsencode(f"{place}/{PREFIX}12345678{SESSION}"))
@@ -90,5 +90,5 @@ def _made_folder() -> Path:
 
 
 def _places() -> list[str]:
-    """Folders for temporary files, the one that the user wants first."""
+    """List the folders for temporary files, the one that the user wants first."""
     return list(dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")))

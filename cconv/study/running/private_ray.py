@@ -1,7 +1,7 @@
-"""What keeps a Ray to its owner: a folder and a token that nobody else reads, and listeners on loopback alone.
+"""Protection of Ray from other users: a token that only the owner of the run can read, and ports on loopback only.
 
-Ray runs whatever code a client sends it. So a Ray of ours demands a token that only the owner of the run can read, also
-on this machine, and binds every port to 127.0.0.1; a cluster that is joined must demand a token too.
+Ray executes any code that a client sends. So a private Ray demands the token, also from clients on this machine, and
+binds every port to 127.0.0.1. A cluster that a study joins must demand a token too.
 """
 
 import os
@@ -23,16 +23,16 @@ TOKEN_VARIABLES = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
 def demand_tokens() -> None:
-    """Make Ray, here and in the processes that it starts, talk to nobody without a token, whenever it was imported."""
+    """Make Ray refuse everyone without a token, here and in the processes that it starts, even if already imported."""
     os.environ["RAY_AUTH_MODE"] = "token"
     Config.initialize("")
 
 
 @contextmanager
 def token_of_this_run(folder: Path) -> Iterator[None]:
-    """Make the token that Ray demands a fresh random one, which stands in `folder`.
+    """Write a new random token to `folder` and make Ray demand it.
 
-    The environment names the file and never holds the token, as programs print environments into logs.
+    The environment names the file but does not hold the token, because programs print environments to logs.
     """
     path = folder / TOKEN
     with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
@@ -51,12 +51,12 @@ def token_of_this_run(folder: Path) -> Iterator[None]:
 
 
 def on_loopback_alone() -> AbstractContextManager[None]:
-    """Let Ray's processes listen on 127.0.0.1 only, which Ray itself does where it supports no clusters."""
+    """Let Ray's processes listen on 127.0.0.1 only, as Ray does on systems on which it supports no clusters."""
     return _constant_of_ray("ENABLE_RAY_CLUSTER", False)
 
 
 def asking_once() -> AbstractContextManager[None]:
-    """Let Ray ask a cluster that does not let it in once, not twenty times; each takes 40 seconds."""
+    """Let Ray try only once, not twenty times, to join a cluster that refuses it; each try takes 40 seconds."""
     return _constant_of_ray("NUM_REDIS_GET_RETRIES", 1)
 
 
@@ -71,7 +71,7 @@ def _constant_of_ray(name: str, value: int) -> Iterator[None]:
 
 
 def kill_processes_of(folder: Path) -> None:
-    """End what Ray started in a private folder and left there when it did not come up."""
+    """Kill the processes that Ray left in a private folder when it failed to start."""
     for process in psutil.Process().children(recursive=True):
         try:
             if str(folder) in " ".join(process.cmdline()):
@@ -97,12 +97,12 @@ def _has_token() -> bool:
     AuthenticationTokenLoader.instance().reset_cache()
     try:
         return AuthenticationTokenLoader.instance().has_token(ignore_auth_mode=True)
-    except AuthenticationError:  # the file that the environment names is not there or empty
+    except AuthenticationError:  # the file that the environment names is missing or empty
         return False
 
 
 def _token_file() -> Path | None:
-    """The file that Ray reads the token from; None where the environment holds the token itself."""
+    """Return the file that Ray reads the token from; None if the environment holds the token itself."""
     if os.environ.get("RAY_AUTH_TOKEN"):
         return None
     return Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")

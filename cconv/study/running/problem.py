@@ -1,4 +1,4 @@
-"""What all trials of a study share: the scene, the task and its samples."""
+"""The problem that all trials of a study share: the scene, the task and its samples."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,10 +27,10 @@ class Problem:
     """Scene, task and samples of a study.
 
     Attributes:
-        scene: What all trajectories share.
-        task: What is asked.
-        train_samples: Frames to learn from; features and targets are standardised by them.
-        valid_samples: Frames that the search compares by.
+        scene: Scene of all trajectories.
+        task: Task of the models.
+        train_samples: Frames of the training split; features and targets are standardised by them.
+        valid_samples: Frames of the validation split, by whose error the search compares models.
     """
 
     scene: Scene
@@ -40,15 +40,20 @@ class Problem:
 
     @property
     def objective(self) -> Objective:
-        """What models are compared by."""
+        """The error that models are compared by."""
         return objective_of(self.task)
 
+    @property
+    def typical_samples(self) -> Sequence[Sample]:
+        """Training samples whose means and variances are those of all: all of them, or windows spread over them."""
+        return self.train_samples.spread if isinstance(self.train_samples, WindowSamples) else self.train_samples
+
     def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
-        """Error of a model on the validation split, with geometries computed afresh unless a cache is given."""
+        """Compute the error of a model on the validation split; without a cache all geometries are computed anew."""
         return self.objective.error(model, self.valid_samples, geometry)
 
     def examples(self, training: TrainingConfig, seed: int) -> Examples:
-        """What a training learns from, with its noise.
+        """Make the examples of a training, with its noise.
 
         Raises:
             ConfigError: If noise is asked for where there is no window to add it to.
@@ -60,22 +65,22 @@ class Problem:
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), seed)
 
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
-        """A fresh model with the initial weights of `init_seed`."""
+        """Build an untrained model with the initial weights of `init_seed`."""
         return build_model(
             configuration.network,
             self.task,
             configuration.features,
             self.scene,
-            self.train_samples.spread if isinstance(self.train_samples, WindowSamples) else self.train_samples,
+            self.typical_samples,
             torch.Generator().manual_seed(init_seed),
         )
 
 
 def open_study_data(data: DataConfig, data_seed: int) -> Dataset:
-    """The data set of a study.
+    """Open the data set of a study.
 
     Raises:
-        ConfigError: If the study names none.
+        ConfigError: If the study names no data.
         DataError: If it cannot be read.
     """
     if data.path is None:
@@ -93,17 +98,17 @@ def open_study_data(data: DataConfig, data_seed: int) -> Dataset:
 
 
 def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
-    """The study on the data at `path`.
+    """Return the study with the data at `path`.
 
     Raises:
-        ConfigError: If study.json could not hold that path.
+        ConfigError: If study.json cannot hold that path.
     """
     check_setting(PathText, path, "--data")
     return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
 
 
 def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[Sample]:
-    """Samples of a split for the study's task: of the training split to learn from, of others to compare models by."""
+    """Make the samples of a split for the task of a study, of the training split those to learn from."""
     task = study_task(study.task, dataset.scene)
     if isinstance(task, StepTask) and split == "train":
         return window_samples(dataset, split, task, future=1, stride=1)
@@ -111,7 +116,7 @@ def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[
 
 
 def study_task(task: TaskConfig, scene: Scene) -> Task:
-    """The task of a study in its scene."""
+    """Make the task of a study for its scene."""
     length = task.smoothing_length
     relative = 1.0 if length is None else length / scene.particle_spacing
     return task_named(task.name, task.kernel, relative, task.history)
@@ -120,7 +125,7 @@ def study_task(task: TaskConfig, scene: Scene) -> Task:
 def load_problem(
     study: StudyConfig, dataset: Dataset, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
 ) -> Problem:
-    """Training and validation samples of a study; the test split stays untouched.
+    """Load the training and validation samples of a study; the test split is not read.
 
     Args:
         study: The study.
@@ -137,32 +142,33 @@ def load_problem(
 
 
 def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
-    """What a checkpoint's card says of the data, so that its errors can be computed again.
+    """Describe the data for the card of a checkpoint, so that its errors can be computed again.
 
     Args:
         study: The study.
-        dataset: Its data, of which a fingerprint is kept; None where that follows later.
+        dataset: Its data, for their fingerprint; None if the fingerprint is added later.
     """
     fingerprint = {} if dataset is None else {"data_sha256": dataset.fingerprint()}
-    return {"study": study.name, "task": study.task.name, "data": study.data.model_dump(mode="json"), **fingerprint}
+    asked = {"task": study.task.name, "horizon": study.task.horizon}
+    return {"study": study.name, **asked, "data": study.data.model_dump(mode="json"), **fingerprint}
 
 
 def open_card_data(card: Mapping, path: str | None = None, given: Mapping | None = None) -> tuple[Dataset, bool]:
-    """The data that a checkpoint is asked on: those of its card, or others.
+    """Open the data that a checkpoint is evaluated on: those of its card, or others.
 
-    What the card says of masses, spacing, time and force holds for the data that the model was trained on, in their
-    folder or in another with the same content. Other data speak for themselves.
+    Masses, spacing, time step and force of the card are used for the data that the model was trained on, in their
+    folder or in another one with the same content. For other data they are read from these data.
 
     Args:
         card: Card of the checkpoint.
         path: Folder of the data; None for the card's.
-        given: `mass`, `particle_spacing`, `frame_dt` and `force` as the user says; None where he does not.
+        given: `mass`, `particle_spacing`, `frame_dt` and `force` from the user; None if not given.
 
     Returns:
         The data set, and whether the model was trained on it.
 
     Raises:
-        ConfigError: If the card's settings do not fit, or other data lack what the card says of its own.
+        ConfigError: If the card's settings do not fit, or other data lack a value that the card has for its own data.
         DataError: If the data cannot be read.
     """
     own = validated(DataConfig, card.get("data", {}), "card.json, data")
@@ -188,7 +194,7 @@ def _same_folder(path: str, other: str | None) -> bool:
 
 
 def _check_stored(other: Dataset, name: str, of_card: float | None, said: Mapping) -> None:
-    """Refuse data that lack what the card says of its own data, unless the user says it."""
+    """Refuse data that lack a value that the card has for its own data, unless the user gives it."""
     topic = f"{OVERRIDES[name]}: "
     lines = [line.removeprefix(topic) for line in other.scene.missing if line.startswith(topic)]
     if lines and of_card is not None and name not in said:

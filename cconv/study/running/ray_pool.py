@@ -1,4 +1,4 @@
-"""Trainings side by side with Ray Tune, on this machine or on a cluster."""
+"""Trainings in parallel with Ray Tune, on this machine or on a cluster."""
 
 import os
 import shutil
@@ -14,9 +14,9 @@ os.environ.update(
     RAY_USAGE_STATS_ENABLED="0",
     RAY_CHDIR_TO_TRIAL_DIR="0",  # data paths stay valid
     RAY_AIR_NEW_OUTPUT="0",  # its boxes are printed even when silent
-    RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="0",  # leave the accelerators' variables alone
-    TUNE_DISABLE_SIGINT_HANDLER="1",  # Ctrl-C is ours
-    TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # our records are the truth
+    RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO="0",  # keep the variables of accelerators
+    TUNE_DISABLE_SIGINT_HANDLER="1",  # we handle Ctrl-C
+    TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1",  # results come from our records
     TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S="0",
     TUNE_GLOBAL_CHECKPOINT_S="1000000",  # Ray's own state is never restored
     TUNE_WARN_THRESHOLD_S="60",
@@ -48,21 +48,21 @@ if TYPE_CHECKING:  # inner names of Ray, which a release may move
     from ray.tune.execution.tune_controller import TuneController
     from ray.tune.experiment import Trial as RayTrial
 
-QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # what fails is in our records
+QUIET = {"log_to_driver": False, "logging_level": "CRITICAL"}  # failures are in our records
 OBJECT_STORE_BYTES = 2**30
-STARTS = 3  # of a Ray of our own; on a busy machine it may take longer than the 30 seconds that it gives itself
+STARTS = 3  # attempts to start a private Ray; on a busy machine it may take longer than its limit of 30 seconds
 CONNECTION_SECONDS = 5.0
-RESTARTS = 2  # of a training whose process or node died; it goes on from its last evaluation
+RESTARTS = 2  # of a training whose process or node died; it continues from its last evaluation
 
 
 @contextmanager
 def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | None = None) -> Iterator["RayPool"]:
-    """A private Ray on this machine with a core a training, or the cluster at `address`; its files go when it ends.
+    """Start a private Ray with one core a training, or join the cluster at `address`; delete its files in the end.
 
-    The private one listens on loopback alone and demands a token of this run; a cluster must demand the user's.
+    The private Ray listens on loopback only and demands the token of this run. A cluster must demand the user's token.
 
     Raises:
-        ConfigError: If Ray cannot start here, or there is no cluster at the address that can be joined.
+        ConfigError: If Ray cannot start on this machine, or the cluster cannot be joined.
     """
     folder = folder.absolute()
     with ExitStack() as stack:
@@ -74,7 +74,7 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
             stack.enter_context(on_loopback_alone())
         stack.callback(ray.shutdown)
         _start(study.concurrency, own) if address is None else _join(address)
-        ray._private.worker._worker_logs_enabled = False  # our records say what died
+        ray._private.worker._worker_logs_enabled = False  # our records say which training died
         yield RayPool(study, problem, folder)
 
 
@@ -85,7 +85,7 @@ def _start(cores: int, folder: Path) -> None:
         try:
             ray.init("local", num_cpus=cores, **settings, **QUIET)
             return
-        except Exception as error:  # of no kind of its own where it took too long
+        except Exception as error:  # Ray has no class for a start that takes too long
             ray.shutdown()
             kill_processes_of(folder)
             if left:
@@ -98,9 +98,10 @@ def _start(cores: int, folder: Path) -> None:
 
 
 def _join(address: str) -> None:
+    """Join the cluster at an address."""
     host, _, port = address.rpartition(":")
     try:
-        if port.isdigit():  # Ray itself would try for minutes
+        if port.isdigit():  # Ray would try for minutes
             socket.create_connection((host, int(port)), CONNECTION_SECONDS).close()
         check_token_of_cluster(address)
         with asking_once():
@@ -121,8 +122,8 @@ class RayPool:
 
     Args:
         study: The study.
-        problem: What all trainings share; sent to every node once.
-        folder: Ray's own files, which nothing of ours reads; on a cluster on the storage that all nodes share.
+        problem: Scene, task and samples; sent to every node once.
+        folder: Folder of Ray's own files, which are not read again; on a cluster, on the storage that all nodes share.
     """
 
     def __init__(self, study: StudyConfig, problem: Problem, folder: Path):
@@ -131,19 +132,19 @@ class RayPool:
 
     @property
     def concurrency(self) -> int:
-        """Trainings at once: as many as the pool has cores, unless the study says otherwise."""
+        """Number of trainings at the same time: that of the study, or else of the cores of the pool."""
         return self._study.search.concurrency or sum(_cores_by_node())
 
     @property
     def concurrency_of_a_node(self) -> int:
-        """Trainings at once that share the memory of a node."""
+        """Number of trainings at the same time that share the memory of a node."""
         return min(self.concurrency, max(_cores_by_node()))
 
     def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
-        """Train every job of a queue that does not stop earlier to the full budget of `training`.
+        """Train every job of a queue to the full budget of `training`, unless it is stopped before.
 
         Raises:
-            ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
+            ConfigError: If the disk is full; the records stay, and the stage can be resumed.
         """
         shared, cache = self._shared, training.cache_megabytes // self.concurrency_of_a_node
         training = training.model_copy(update={"cache_megabytes": cache})
@@ -185,16 +186,16 @@ def _cores_by_node() -> list[int]:
 
 
 class _NeverRestored:
-    """Ray pickles what drives a run in order to restore it from its own files, which we never do."""
+    """An object that Ray may pickle without its state: Ray would restore a run from it, which we never do."""
 
     def __getstate__(self) -> dict:
         return {}
 
 
 class _Driver(_NeverRestored, tune.Callback):
-    """Passes on what Ray and the queue have to say to each other, until an error of the queue ends the run.
+    """The connection between Ray and the queue, until an error of the queue ends the run.
 
-    Ray keeps no more of such an error than its text, and may speak of further trials while it gives up.
+    Ray keeps only the text of such an error, and may report further trials while it stops.
     """
 
     def __init__(self, queue: TrialQueue):
@@ -212,17 +213,17 @@ class _Driver(_NeverRestored, tune.Callback):
             raise
 
     def next(self) -> Job | None:
-        """The next job."""
+        """Return the next job; None if there is none left."""
         with self._ends_the_run() as queue:
             return queue.next()
 
     def goes_on(self, trial: "RayTrial", result: dict) -> bool:
-        """Whether a trial goes on after an evaluation; a last word of the training is none."""
+        """Tell whether a trial continues after a report; one with an outcome ends by itself."""
         with self._ends_the_run() as queue:
             return result["outcome"] is not None or queue.on_result(str(trial), result)
 
     def on_trial_complete(self, iteration: int, trials: list["RayTrial"], trial: "RayTrial", **info: object) -> None:
-        """A training said how it ended, or was stopped after its last evaluation."""
+        """Record the outcome of a training that ended by itself or was stopped after its last evaluation."""
         last = trial.last_result
         with self._ends_the_run() as queue:
             if last["outcome"] == DISK_FULL:
@@ -230,43 +231,45 @@ class _Driver(_NeverRestored, tune.Callback):
             queue.on_end(str(trial), last["outcome"] or queue.outcome_after(last), last["reason"])
 
     def on_trial_error(self, iteration: int, trials: list["RayTrial"], trial: "RayTrial", **info: object) -> None:
-        """The training's process or node died too often."""
+        """Record that the process or node of a training died too often."""
         with self._ends_the_run() as queue:
             queue.on_end(str(trial), "failed", f"its process or node died {RESTARTS + 1} times")
 
 
 class _Jobs(_NeverRestored, Searcher):
-    """Hands the jobs of a queue to Ray."""
+    """The source of jobs for Ray, which takes them from a queue."""
 
     def __init__(self, driver: _Driver):
         super().__init__()
         self._driver = driver
 
     def suggest(self, trial_id: str) -> dict | str:
-        """The next job, when a place is free."""
+        """Return the next job; Ray asks when a core is free."""
         job = self._driver.next()
         return Searcher.FINISHED if job is None else {"job": job}
 
     def on_trial_complete(self, trial_id: str, result: dict | None = None, error: bool = False) -> None:
-        """Nothing: the queue hears it from the driver."""
+        """Do nothing: the driver tells the queue."""
 
     def save(self, checkpoint_path: str) -> None:
-        """Nothing: the records are what a run is resumed from."""
+        """Do nothing: a run is resumed from the records."""
 
 
 class _Judge(_NeverRestored, FIFOScheduler):
-    """Stops a trial when the queue says so."""
+    """The scheduler of Ray, which stops a trial if the queue decides so."""
 
     def __init__(self, driver: _Driver):
         super().__init__()
         self._driver = driver
 
     def on_trial_result(self, tune_controller: "TuneController", trial: "RayTrial", result: dict) -> str:
-        """Ask the queue."""
+        """Ask the queue whether the trial continues."""
         return TrialScheduler.CONTINUE if self._driver.goes_on(trial, result) else TrialScheduler.STOP
 
 
 class _Silent(tune.ProgressReporter):
+    """A reporter that prints nothing."""
+
     def should_report(self, trials, done=False):
         return False
 
@@ -275,7 +278,7 @@ class _Silent(tune.ProgressReporter):
 
 
 def _train_and_report(job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem) -> None:
-    """Train a job in a process of Ray, and tell Ray every report."""
+    """Train a job in a process of Ray and pass every report to Ray."""
     torch.set_num_threads(1)
     for report in train_recorded(job, stage, training, study, problem):
         tune.report(report.entry | {"outcome": report.outcome, "reason": report.reason})

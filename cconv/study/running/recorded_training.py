@@ -1,4 +1,4 @@
-"""One job of a queue trained in this process, whatever happens to it: what every pool does with each."""
+"""Training of a job in this process, for every pool: its failures are recorded and do not end the process."""
 
 from collections.abc import Generator, Iterator
 from typing import NamedTuple
@@ -13,18 +13,17 @@ from cconv.study.running.trial import Trial, run_trial
 from cconv.study.running.trial_queue import Job
 from cconv.training.loop import TrainingState
 
-HANGING = 2.0  # times its limit after which a training's process is ended from outside
+HANGING = 2.0  # times its limit a training may take before its process is ended
 DISK_FULL = "disk full"
 
 
 class Report(NamedTuple):
-    """What a training has to say.
+    """A report of a training: an evaluation or the outcome.
 
     Attributes:
-        entry: Its last evaluation; zero updates before the first.
-        outcome: How it ended, where the training itself knows: "failed", "stopped" at its limit of time, or
-            `DISK_FULL`. None after an evaluation.
-        reason: Why, for a reader of the records.
+        entry: The last evaluation; zero updates before the first.
+        outcome: "failed", "stopped" at the time limit, or `DISK_FULL`, if the training ended by itself; else None.
+        reason: The reason for the outcome, or "".
     """
 
     entry: dict
@@ -35,9 +34,9 @@ class Report(NamedTuple):
 def train_recorded(
     job: Job, stage: str, training: TrainingConfig, study: StudyConfig, problem: Problem
 ) -> Generator[Report, None, None]:
-    """Train a job; reports every evaluation, then how it ended if the training itself knows.
+    """Train a job and yield a report for every evaluation, and for the outcome if the training ends by itself.
 
-    An error of the training is an outcome of the job, not an exception. A training that hangs ends this process.
+    An error of the training is an outcome of the job, not an exception. If the training hangs, this process is ended.
     """
     limit = _seconds_limit(study, training)
     last: dict = {"updates": 0, "valid_error": None, "diverged": False, "seconds": 0.0}
@@ -56,12 +55,12 @@ def train_recorded(
 
 
 def disk_is_full(job: Job, reason: str) -> ConfigError:
-    """The error that ends a run in which a training found the disk full."""
+    """Make the error that ends a run in which a training found the disk full."""
     return ConfigError(f"{job.folder}: {reason}; make room, then `cconv study resume`.")
 
 
 def _seconds_limit(study: StudyConfig, training: TrainingConfig) -> float:
-    """Time that a training may take: the limit of a trial, and more in proportion for a budget beyond a trial's."""
+    """Return the time limit of a training: that of a trial, or more in proportion to a budget beyond a trial's."""
     return study.search.trial_seconds * max(1.0, training.updates / study.training.updates)
 
 
@@ -73,7 +72,7 @@ def _trial(
             attempt.check()
 
     folder = TrialFolder(job.folder)
-    yield from folder.log()[-1:]  # an earlier attempt may have died before it was judged
+    yield from folder.log()[-1:]  # an earlier attempt may have died before the judge saw it
     trial = Trial(
         stage=stage,
         parameters=job.parameters,
@@ -93,6 +92,6 @@ def _trial(
 
 def _record_what_failed(job: Job, stage: str, outcome: str) -> None:
     folder = TrialFolder(job.folder)
-    if outcome == "failed" and not folder.started:  # it failed before it could say what it is
+    if outcome == "failed" and not folder.started:  # it failed before its configuration was written
         known = {"stage": stage, "parameters": job.parameters, "init_seed": job.init_seed}
         folder.start(known | {"num_parameters": None, "flops_per_particle": None})

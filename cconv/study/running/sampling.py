@@ -1,4 +1,4 @@
-"""Which configurations a search tries: pure functions of seed, number and records, so that a search can be resumed."""
+"""The choice of the configurations of a search, from seed, number and records alone, so that it can be resumed."""
 
 import math
 import warnings
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 Affordable = Callable[[dict[str, Value]], bool]
 
 MAX_DRAWS = 1000
-MAX_PROPOSALS = 16  # of the sampler, before a random configuration takes their place
+MAX_PROPOSALS = 16  # of the sampler, before a random configuration replaces them
 STARTUP_TRIALS = 8
-UNBEARABLE = 1e3  # scalarised value of what diverged or is too expensive; values of others are of order one
+UNBEARABLE = 1e3  # scalarised value of a trial that diverged or is too expensive; other values are of order one
 AUGMENTATION = 0.05
 
 
 def draw(space: SearchSpace, rng: np.random.Generator) -> dict[str, Value]:
-    """One random configuration of active parameters, each drawn evenly on its scale."""
+    """Draw a random configuration of active parameters, each uniformly on its scale."""
     drawn: dict[str, Value] = {}
     for name in space.parents_first:
         if space.is_active(name, drawn):
@@ -38,7 +38,7 @@ def draw(space: SearchSpace, rng: np.random.Generator) -> dict[str, Value]:
 def _draw_value(parameter: Parameter, rng: np.random.Generator) -> Value:
     if isinstance(parameter, Choice):
         return parameter.values[rng.integers(len(parameter.values))]
-    half = 0.5 if parameter.type == "int" else 0.0  # whole numbers stand for the interval around them
+    half = 0.5 if parameter.type == "int" else 0.0  # a whole number represents the interval around it
     low, high = parameter.range[0] - half, parameter.range[1] + half
     value = math.exp(rng.uniform(math.log(low), math.log(high))) if parameter.scale == "log" else rng.uniform(low, high)
     value = round(value) if parameter.type == "int" else value
@@ -46,13 +46,13 @@ def _draw_value(parameter: Parameter, rng: np.random.Generator) -> Value:
 
 
 def random_parameters(space: SearchSpace, seed: int, index: int, affordable: Affordable) -> dict[str, Value]:
-    """Configuration number `index` of a random search, whatever was drawn before it.
+    """Draw configuration number `index` of a random search; it does not depend on the ones before.
 
     Args:
         space: The search space.
         seed: Seed of the search.
         index: Number of the configuration.
-        affordable: Whether a configuration is below the space's cap on cost.
+        affordable: Function that tells whether a configuration is below the space's caps on cost.
 
     Raises:
         ConfigError: If hardly any configuration is affordable.
@@ -86,22 +86,22 @@ def suggest_parameters(
     costs: Mapping[str, float],
     useless_error: float,
 ) -> dict[str, Value]:
-    """Configuration number `number` of an adaptive search for error and cost, given what is known of earlier ones.
+    """Propose configuration number `number` of an adaptive search for small error and cost, from the earlier trials.
 
     A tree-structured Parzen estimator (Watanabe, arXiv 2304.11127) minimises an augmented Chebyshev norm of error and
-    cost whose weights change from proposal to proposal, so that all of the front is searched (Knowles, "ParEGO", IEEE
-    TEVC 10, 2006). Only trials of the full budget are complete; others count as pruned, by how far they came. Records
-    whose parameters are no configuration of the space are left out.
+    cost. Its weights change from proposal to proposal, so that the whole Pareto front is searched (Knowles, "ParEGO",
+    IEEE TEVC 10, 2006). Only trials of the full budget are complete; the others are pruned at their last evaluation.
+    Records whose parameters are no configuration of the space are left out.
 
     Args:
         space: The search space.
         records: Earlier trials, finished or not.
-        number: Number of the proposal; it chooses the weights.
+        number: Number of the proposal, which determines the weights.
         seed: Seed of the search.
         full_updates: Budget of a trial that was never stopped.
-        affordable: Whether a configuration is below the space's cap on cost.
+        affordable: Function that tells whether a configuration is below the space's caps on cost.
         costs: FLOPs per particle of each trial, by id.
-        useless_error: Error of predicting the mean, up to which errors count.
+        useless_error: Error of predicting the mean; larger errors are replaced by it.
 
     Raises:
         ConfigError: If hardly any configuration is affordable.
@@ -114,13 +114,15 @@ def suggest_parameters(
     for parameters in _proposals(study, space):
         if affordable(parameters):
             return parameters
-    return _draw_affordable(space, np.random.default_rng([seed, number, 1]), affordable)  # none of a random search's
+    return _draw_affordable(
+        space, np.random.default_rng([seed, number, 1]), affordable
+    )  # other draws than those of a random search
 
 
 def error_weight(number: int) -> float:
-    """Weight of the error against the cost in proposal `number`: 1, then evenly spread over (1/2, 1].
+    """Return the weight of the error in proposal `number`: 1 for the first, then evenly spread over (1/2, 1].
 
-    The van der Corput sequence in base 2, halved and taken off 1.
+    It is 1 minus half of the van der Corput sequence in base 2.
     """
     digits = f"{number:b}"[::-1]
     return 1 - 0.5 * sum(int(digit) / 2**place for place, digit in enumerate(digits, start=1))
@@ -128,12 +130,12 @@ def error_weight(number: int) -> float:
 
 @dataclass(frozen=True)
 class _Scalarization:
-    """Augmented Chebyshev norm of log10 error and log10 cost, each from 0 to 1 over the records."""
+    """The augmented Chebyshev norm of log10 error and log10 cost, which are scaled to 0 to 1 over the records."""
 
     log_errors: tuple[float, float]
     log_costs: tuple[float, float]
     error_weight: float
-    useless_error: float  # that of predicting the mean: how much worse a model is does not matter
+    useless_error: float  # that of predicting the mean; it does not matter how much worse a model is
 
     @classmethod
     def of(
@@ -166,7 +168,7 @@ def _log(value: float) -> float:
 
 
 def distributions_of(space: SearchSpace, parameters: Mapping[str, Value]) -> dict[str, "BaseDistribution"]:
-    """Optuna distributions of the parameters of a configuration."""
+    """Return the Optuna distributions of the parameters of a configuration."""
     return {name: _distribution(space.parameters[name]) for name in parameters}
 
 
@@ -205,7 +207,7 @@ def _as_optuna(
     costs: Mapping[str, float],
     scalarize: _Scalarization,
 ) -> "FrozenTrial":
-    """A record as a trial of Optuna; one that diverged ranks behind all that were stopped."""
+    """Convert a record to a trial of Optuna; one that diverged ranks behind all that were stopped."""
     from optuna.trial import TrialState, create_trial
 
     values = {
@@ -225,7 +227,7 @@ def _as_optuna(
 
 
 def _proposals(study: "Study", space: SearchSpace) -> Iterator[dict[str, Value]]:
-    """What the sampler proposes; a proposal that is not taken counts as unbearable for the next one."""
+    """Yield proposals of the sampler; one that is not taken is recorded as unbearable for the next one."""
     from optuna.trial import TrialState
 
     for _ in range(MAX_PROPOSALS):
@@ -241,6 +243,8 @@ def _proposals(study: "Study", space: SearchSpace) -> Iterator[dict[str, Value]]
 
 def _suggest(trial: "Trial", name: str, parameter: Parameter) -> Value:
     if isinstance(parameter, Choice):
-        return cast(Value, trial.suggest_categorical(name, parameter.values))  # one of them, and none is None
+        return cast(
+            Value, trial.suggest_categorical(name, parameter.values)
+        )  # one of the values, none of which is None
     suggest = trial.suggest_int if parameter.type == "int" else trial.suggest_float
     return suggest(name, *parameter.range, log=parameter.scale == "log")

@@ -11,30 +11,30 @@ from cconv.study.running.trial_queue import Job, TrialQueue
 
 
 class SerialPool:
-    """A `Pool` that leaves the records of a Ray that trains one job at a time, to the last bit.
+    """A `Pool` of this process, whose records are equal to the last bit to those of Ray with one job at a time.
 
-    A training whose process dies or hangs takes the run with it; when the run is resumed, one that hung has failed.
+    If a training hangs or its process dies, the run ends too. When the run is resumed, a training that hung has failed.
 
     Args:
         study: The study.
-        problem: What all trainings share.
+        problem: Scene, task and samples.
     """
 
     def __init__(self, study: StudyConfig, problem: Problem):
         self._study, self._problem = study, problem
 
     def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
-        """Train every job of a queue that does not stop earlier to the full budget of `training`.
+        """Train every job of a queue to the full budget of `training`, unless it is stopped before.
 
         Raises:
-            ConfigError: If the disk is full; what was recorded stays, and the stage can be resumed.
+            ConfigError: If the disk is full; the records stay, and the stage can be resumed.
         """
-        with torch_threads(1):  # as a process of a pool, on whose number the last bits of sums depend
+        with torch_threads(1):  # as in a process of Ray; the last bits of sums depend on the number of threads
             while (job := queue.next()) is not None:
                 queue.on_end(job.name, *self._train(job, queue, stage, training))
 
     def _train(self, job: Job, queue: TrialQueue, stage: str, training: TrainingConfig) -> tuple[str, str]:
-        """Outcome of a job, and the reason for it."""
+        """Train a job and return its outcome and the reason for it."""
         with closing(train_recorded(job, stage, training, self._study, self._problem)) as reports:
             for entry, outcome, reason in reports:
                 if outcome == DISK_FULL:

@@ -1,4 +1,4 @@
-"""One trial: a configuration trained, evaluated and recorded. Knows nothing of Ray."""
+"""One trial: a configuration is trained, evaluated and recorded, without Ray."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -18,14 +18,14 @@ from cconv.validation import Value
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """A configuration to train, and what its records say of it.
+    """A configuration to train, with the facts for its records.
 
     Attributes:
-        stage: Stage that it belongs to.
-        parameters: Hyperparameters that replace the study's own.
+        stage: Stage that the trial belongs to.
+        parameters: Hyperparameters that replace those of the study.
         init_seed: Seed of the initial weights.
         data_seed: Seed of the batch order.
-        provenance: Where the data come from, for the checkpoint's card.
+        provenance: Origin of the data, for the card of the checkpoint.
     """
 
     stage: str
@@ -44,19 +44,19 @@ def run_trial(
     seconds_limit: float = math.inf,
     on_update: Callable[[TrainingState], None] = lambda state: None,
 ) -> Iterator[dict]:
-    """Train one configuration, from where an earlier process left it; yields an entry at every evaluation.
+    """Train one configuration, or continue its training, and yield an entry at every evaluation.
 
-    Everything is on disk before an entry is yielded: the log, the progress from which a killed training goes on, and
-    the checkpoint of the best validation error so far; on Ctrl-C before the first evaluation the checkpoint is the
-    model as it stands. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
+    Before an entry is yielded, everything is on disk: the log, the progress from which a killed training continues, and
+    the checkpoint with the smallest validation error so far. On Ctrl-C before the first evaluation the checkpoint is
+    the model at that moment. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
 
     Args:
         problem: Scene, task and samples.
-        trial: What is trained.
-        defaults: What the study says where nothing is drawn.
-        folder: Where config.json, log.jsonl, progress.safetensors and checkpoint/ are written.
-        seconds_limit: Time that the training may take in all; it ends at the first update after that.
-        on_update: Sees the state after every update.
+        trial: The configuration and its records.
+        defaults: Configuration of the study, for hyperparameters that the trial does not set.
+        folder: Folder for config.json, log.jsonl, progress.safetensors and checkpoint/.
+        seconds_limit: Time limit of the whole training, which ends at the first update after it.
+        on_update: Function that is called with the state after every update.
     """
     configuration = configure(trial.parameters, defaults)
     training = configuration.training
@@ -96,7 +96,7 @@ def run_trial(
 
 
 def describe(problem: Problem, trial: Trial, model: Model, training: TrainingConfig) -> dict:
-    """What config.json says of a model and its training before it begins."""
+    """Describe a model and its training for config.json, before the training begins."""
     return {
         "stage": trial.stage,
         "parameters": dict(trial.parameters),
@@ -120,7 +120,7 @@ def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progr
 
 
 def _best_so_far(folder: TrialFolder) -> float:
-    """Validation error of the checkpoint of an earlier process; infinity where there is none."""
+    """Return the validation error of an earlier process's checkpoint; infinity if there is none."""
     known = read_card(folder.checkpoint).get("valid_error") if folder.progress.is_file() else None
     return math.inf if known is None else known
 

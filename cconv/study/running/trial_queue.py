@@ -1,4 +1,4 @@
-"""The trainings of a stage, one after another: handed out, judged at the rungs, ended. Knows nothing of Ray."""
+"""The queue of the trainings of a stage, which gives them to a pool, stops bad ones and records their outcomes."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,8 +16,8 @@ class Job:
     """One training.
 
     Attributes:
-        folder: Where it is recorded.
-        name: Name to show.
+        folder: Folder of its records.
+        name: Name for messages.
         parameters: Hyperparameters.
         init_seed: Seed of the initial weights.
     """
@@ -29,46 +29,48 @@ class Job:
 
 
 def job_in(folder: TrialFolder, name: str, parameters: Mapping, init_seed: int) -> Job:
-    """A training that is recorded in a folder.
+    """Make a training that is recorded in a folder.
 
     Raises:
-        ConfigError: If the folder's training was begun with other hyperparameters.
+        ConfigError: If the training in the folder began with other hyperparameters.
     """
     folder.check_begun_with(parameters)
     return Job(folder=folder.path.absolute(), name=name, parameters=dict(parameters), init_seed=init_seed)
 
 
 class Judge(Protocol):
-    """Decides after every evaluation whether a training goes on."""
+    """A rule that decides after every evaluation whether a training continues."""
 
     def goes_on(self, name: str, entry: Mapping) -> bool:
-        """Whether a training goes on after an evaluation."""
+        """Tell whether a training continues after an evaluation."""
 
 
 class NothingStops:
-    """Judge of trainings that all go to the end."""
+    """The rule without early stopping: only a training that diverged ends before the full budget."""
 
     def goes_on(self, name: str, entry: Mapping) -> bool:
-        """Whether a training goes on after an evaluation."""
+        """Tell whether a training continues after an evaluation."""
         return not entry["diverged"]
 
 
 class StopsByRungs:
-    """Judge that stops a trial whose error is not finite, hopeless, or beaten at its rung, and keeps the rungs on disk.
+    """The rule of ASHA: a trial stops if it is not among the best at its rung. The rungs are kept on disk.
+
+    A trial also stops if its error is not finite or too large.
 
     Args:
         file: File of the rungs of all stages.
         stage: Stage of the trials.
-        table: Its rungs.
-        give_up_above: Error at which a trial is stopped whatever the rung holds; the first trial at a rung would
-            otherwise always go on.
+        table: Rungs of the stage.
+        give_up_above: Error above which a trial is always stopped; otherwise the first trial at a rung would always
+            continue.
     """
 
     def __init__(self, file: RungFile, stage: str, table: RungTable, give_up_above: float = math.inf):
         self._file, self._stage, self._table, self._give_up_above = file, stage, table, give_up_above
 
     def goes_on(self, name: str, entry: Mapping) -> bool:
-        """Whether a trial goes on after an evaluation."""
+        """Tell whether a trial continues after an evaluation."""
         error = entry["valid_error"]
         if entry["diverged"] or error is None or not math.isfinite(error):
             return False
@@ -78,16 +80,16 @@ class StopsByRungs:
 
 
 class TrialQueue:
-    """Trainings of a stage.
+    """The queue of the trainings of a stage.
 
-    Those that ended in an earlier run of the stage are passed over. One that was cut short is judged again by what it
-    logged, as the kill may have come between an evaluation and its consequence, and handed out if it goes on.
+    Trainings that ended in an earlier run of the stage are skipped. One that was interrupted is first judged again by
+    its log, because the kill may have come between an evaluation and the decision about it, and continues if it may.
 
     Args:
-        jobs: The trainings in their order; each is asked for only when a place is free.
+        jobs: The trainings in order; the next one is made only when a process is free.
         full_updates: Full budget; a training that reaches it is completed.
-        judge: Decides after every evaluation whether a training goes on.
-        observers: See the trainings as they run.
+        judge: Rule that decides after every evaluation whether a training continues.
+        observers: Observers that are told about the trainings.
     """
 
     def __init__(self, jobs: Iterable[Job], full_updates: int, judge: Judge, observers: Sequence[Observer]):
@@ -97,7 +99,7 @@ class TrialQueue:
         self._running: dict[str, Job] = {}
 
     def next(self) -> Job | None:
-        """The next training to run; None if there is none left."""
+        """Return the next training to run; None if there is none left."""
         for job in self._jobs:
             folder = TrialFolder(job.folder)
             if folder.ended:
@@ -110,19 +112,19 @@ class TrialQueue:
         return None
 
     def on_result(self, name: str, entry: Mapping) -> bool:
-        """Take an evaluation; whether the training goes on."""
+        """Tell the observers about an evaluation; return whether the training continues."""
         for observer in self._observers:
             observer.on_trial_result(name, entry)
         return self._judge.goes_on(name, entry)
 
     def on_end(self, name: str, outcome: str, reason: str = "") -> None:
-        """Record how a training ended."""
+        """Record the outcome of a training."""
         TrialFolder(self._running.pop(name).folder).finish(outcome, reason)
         for observer in self._observers:
             observer.on_trial_end(name, outcome, reason)
 
     def outcome_after(self, entry: Mapping) -> str:
-        """How a training ends that does not go on after an evaluation."""
+        """Return the outcome of a training that ends after an evaluation."""
         if entry["diverged"]:
             return "diverged"
         return "completed" if entry["updates"] >= self.full_updates else "stopped"

@@ -26,6 +26,7 @@ class AblationStage(Stage):
     """Retrain models between the baseline and the best finalist, and the best finalist with each feature toggled."""
 
     kind: Literal["ablation"] = "ablation"
+    is_single = True
     uses = ("initialization", "random", "finalists")
     needs_records = True
     seeds: Whole = Field(1, ge=1, le=1000)

@@ -162,7 +162,7 @@ def retrained_finalists(
     """
     retrained, failed = [], {}
     retrainings = run.retrainings()
-    for finalist in finalists:
+    for finalist in dict.fromkeys(finalists):  # two stages of finalists have the baseline in common
         if finalist not in retrainings:
             raise DataError(f"{run.path}: no retraining of {finalist!r} in finalists/; restore it, or run it again.")
         records = retrainings[finalist]

@@ -13,6 +13,7 @@ class ImportanceStage(Stage):
     """Estimate the importance of the hyperparameters at each rung of the random searches, with intervals and tests."""
 
     kind: Literal["importance"] = "importance"
+    is_single = True
     uses = ("random",)
     needs_records = True
 

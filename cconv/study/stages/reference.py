@@ -20,6 +20,7 @@ class ReferenceStage(Stage):
     """Compare each search with the rule that trains all trials to the first rung and the best to the full budget."""
 
     kind: Literal["reference"] = "reference"
+    is_single = True
     uses = ("random", "adaptive")
     needs_records = True
 

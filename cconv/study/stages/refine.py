@@ -12,6 +12,7 @@ class RefineStage(Stage):
     """Narrow the space from the records of earlier stages, with a reason for each hyperparameter."""
 
     kind: Literal["refine"] = "refine"
+    is_single = True
     uses = ("baseline", "initialization", "random")
     needs_records = True
 

@@ -65,6 +65,7 @@ class SelectStage(Stage):
     """Compare the finalists, recommend one, then test all of them."""
 
     kind: Literal["select"] = "select"
+    is_single = True
     uses = ("finalists", "converge")
     needs_records = True
 
@@ -206,8 +207,8 @@ def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> MeanPre
     """Measure the error of always predicting the training mean on each split; a useful model must be well below."""
     problem, objective = session.problem, session.problem.objective
     return MeanPredictor(
-        valid=objective.of_mean_predictor(problem.valid_samples, problem.train_samples),
-        test=objective.of_mean_predictor(test_samples, problem.train_samples),
+        valid=objective.of_mean_predictor(problem.valid_samples, problem.typical_samples),
+        test=objective.of_mean_predictor(test_samples, problem.typical_samples),
     )
 
 

@@ -66,3 +66,19 @@ def test_a_stage_that_converges_names_finalists_that_are_sure_to_be_there():
 def test_budgets_ascend(budgets):
     with pytest.raises(ConfigError, match="budgets"):
         study(random={}, finalists={}, converge={"budgets": budgets})
+
+
+@pytest.mark.parametrize("kind", ["initialization", "reference", "importance", "refine", "ablation", "select"])
+def test_a_second_stage_whose_result_would_replace_the_firsts_is_refused(kind):
+    before = {"random": {}, "finalists": {}}
+    with pytest.raises(
+        ConfigError, match=f"stages `{kind}` and `again` are both of kind {kind}, .*; remove one"
+    ) as told:
+        study(**before, **{kind: {}, "again": {"kind": kind}})
+    assert "\n" not in str(told.value)
+
+
+def test_two_stages_whose_results_are_kept_apart_may_be_of_one_kind():
+    kinds = ("closed_form", "baseline", "random", "adaptive", "finalists")
+    stages = {name: {} for name in kinds} | {f"second-{name}": {"kind": name} for name in kinds}
+    assert len(study(**stages).stages) == 2 * len(kinds)

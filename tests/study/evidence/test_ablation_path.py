@@ -91,5 +91,5 @@ def test_the_same_configuration_needs_no_change(records):
 
 
 def test_too_few_trials_are_refused(records):
-    with pytest.raises(ConfigError, match="9 trials have 9 updates; a surrogate needs 10"):
+    with pytest.raises(ConfigError, match="9 trials have an error after 9 updates; a surrogate needs 10"):
         ablation_order(records[:9], SPACE, BASELINE, BEST, 9, useless_error=1.0)

@@ -43,9 +43,11 @@ def test_the_words_name_both_budgets_and_whether_the_error_still_falls():
     ends = [point("baseline", 162, 0.57), point("baseline_after_6000", 6000, 0.166)]
     found = {"baseline": Convergence(points=ends, still_falling=True)}
     words = budget_words([], found, 0.05)
-    assert "162 updates decided the error of baseline, 0.57: after 6,000 updates it is 0.166" in words
+    assert "162 updates limits the validation error of baseline to 0.57: after 6,000 updates it is 0.166" in words
     assert "still falling" in words
-    assert "bring nothing" in budget_words([], {"baseline": Convergence(points=ends, still_falling=False)}, 0.05)
+    assert "more updates do not lower it" in budget_words(
+        [], {"baseline": Convergence(points=ends, still_falling=False)}, 0.05
+    )
 
 
 def test_a_finalist_whose_error_was_still_falling_is_named_unless_a_larger_budget_tells_more():

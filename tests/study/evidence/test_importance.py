@@ -232,7 +232,7 @@ def test_partial_dependence_refuses_what_it_cannot_show():
     records = trials(12, by_word_and_rate)
     with pytest.raises(ConfigError, match="`only` does not vary in the space; those that do: word, size, rate, count"):
         partial_dependence(records, SPACE, 10, "only", useless_error=1.0)
-    with pytest.raises(ConfigError, match="0 trials have 11 updates"):
+    with pytest.raises(ConfigError, match="0 trials have an error after 11 updates"):
         partial_dependence(records, SPACE, 11, "word", useless_error=1.0)
 
 

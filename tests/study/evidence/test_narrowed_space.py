@@ -118,7 +118,7 @@ def test_trials_are_compared_at_the_largest_budget_that_enough_reached():
 def test_conditions_follow_what_is_left():
     refined, reasons = refine(SPACE, records_of(240), FULL)
     assert "network.mapping" not in refined.parameters
-    assert reasons["network.mapping"] == "left out: nothing that is left of network.message makes it active"
+    assert reasons["network.mapping"] == "left out: no remaining value of network.message makes it active"
     assert refined.parameters["network.kernel_size"].when == {"network.architecture": ["conv_net"]}
 
 

@@ -6,6 +6,7 @@ from systems import configured, problem
 from cconv.models.checkpoint import load_model, read_card
 from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.run_folder import RunFolder
+from cconv.study.running.problem import Problem
 from cconv.study.running.trial import Trial, run_trial
 
 NETWORK = configured(layers=1, kernel_size=3, message="difference")
@@ -29,6 +30,14 @@ def test_log_config_and_checkpoint_agree(generator, tmp_path):
     assert record.config["training"]["learning_rate"] == 0.02
     assert load_model(folder.checkpoint).num_parameters == record.config["num_parameters"]
     assert read_card(folder.checkpoint)["valid_error"] == min(e["valid_error"] for e in entries)
+
+
+def test_the_checkpoint_is_the_best_and_not_the_last(generator, tmp_path, monkeypatch):
+    given, folder, errors = problem(generator), RunFolder(tmp_path).trial("random_0000"), iter((0.5, 0.2, 0.4))
+    monkeypatch.setattr(Problem, "valid_error", lambda *arguments: next(errors))
+    assert [entry["valid_error"] for entry in trial(given, folder)] == [0.5, 0.2, 0.4]
+    card = read_card(folder.checkpoint)
+    assert (card["valid_error"], card["updates"]) == (0.2, 4)
 
 
 def test_every_entry_is_on_disk_before_it_is_seen(generator, tmp_path):

@@ -52,6 +52,12 @@ def test_a_finalist_with_a_lost_seed_is_not_compared_and_said(outcome, run):
     assert "out of memory" in failed["a"]
 
 
+def test_a_finalist_of_two_stages_is_compared_once(run):
+    retrain(run, "a", 1)
+    retrained, _ = retrained_finalists(run, ["a", "a"], 1)
+    assert [finalist.id for finalist in retrained] == ["a"]
+
+
 def test_a_finalist_with_too_few_seeds_is_not_compared(run):
     retrain(run, "a", 1)
     assert retrained_finalists(run, ["a"], 2) == ([], {"a": "only 1 of 2 seeds were trained"})

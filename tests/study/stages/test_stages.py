@@ -1,11 +1,14 @@
 """The list of the kinds of stages: one file each, and nothing else that knows them all."""
 
+import ast
+import inspect
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from cconv.study.declared.stage import Stage, kind_of
+from cconv.study.records.found import Parts
 from cconv.study.stages import STAGES
 
 STAGE_FILES = Path(__file__).parents[3] / "cconv" / "study" / "stages"
@@ -34,3 +37,16 @@ def test_kinds_are_distinct():
 def test_a_stage_uses_known_kinds(stage):
     assert {*stage.uses, *stage.space_kinds} <= KINDS
     assert stage.uses or not stage.needs_records
+
+
+def parts_found_by(stage):
+    """Names of the parts of the summary that the file of a stage sets."""
+    calls = [node for node in ast.walk(ast.parse(inspect.getsource(inspect.getmodule(stage)))) if hasattr(node, "func")]
+    results = [call for call in calls if getattr(call.func, "id", None) == "Found"]
+    return {keyword.arg for result in results for keyword in result.keywords} & Parts.model_fields.keys()
+
+
+def test_of_a_kind_that_sets_a_part_of_the_summary_a_study_has_one_stage():
+    found = {stage: parts_found_by(stage) for stage in STAGES}
+    assert set().union(*found.values()) == Parts.model_fields.keys()
+    assert [stage for stage, parts in found.items() if parts and not stage.is_single] == []
