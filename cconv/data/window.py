@@ -1,7 +1,9 @@
 """Windows: consecutive frames that a step is predicted from, and those that follow."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -99,24 +101,46 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
     )
 
 
-def windows(trajectory: Trajectory, history: int, future: int, stride: int = 1) -> Iterator[Window]:
-    """All windows of a trajectory, or every one at a stride.
+class Windows(Sequence[Window]):
+    """All windows of some trajectories, or every one at a stride, each cut out when it is asked for.
 
-    LagrangeBench's test windows do not overlap: their stride is ``history + future``.
+    They share the frames of the trajectories, in memory and when they are sent to another process. LagrangeBench's test
+    windows do not overlap: their stride is ``history + future``.
 
     Args:
-        trajectory: The trajectory.
+        trajectories: The trajectories.
         history: Frames up to the present, H.
         future: Frames after it, F.
         stride: Frames from one present to the next.
 
     Raises:
-        DataError: If the trajectory is too short for a single one.
+        DataError: If a trajectory is too short for a single one.
     """
-    if len(trajectory) < history + future:
-        raise DataError(
-            f"trajectory {trajectory.name}: has {len(trajectory)} frames, too few for a window of {history} and "
-            f"{future} after it; lower the history, or store more frames."
-        )
-    presents = range(history - 1, len(trajectory) - future, stride)
-    return (window_at(trajectory, present, history, future) for present in presents)
+
+    def __init__(self, trajectories: Iterable[Trajectory], history: int, future: int, stride: int = 1):
+        self._trajectories = list(trajectories)
+        self._history, self._future = history, future
+        self._places = [
+            (number, present)
+            for number, trajectory in enumerate(self._trajectories)
+            for present in self._presents(trajectory, stride)
+        ]
+
+    def _presents(self, trajectory: Trajectory, stride: int) -> range:
+        if len(trajectory) < self._history + self._future:
+            raise DataError(
+                f"trajectory {trajectory.name}: has {len(trajectory)} frames, too few for a window of {self._history} "
+                f"and {self._future} after it; lower the history, or store more frames."
+            )
+        return range(self._history - 1, len(trajectory) - self._future, stride)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            some = copy(self)
+            some._places = self._places[index]
+            return some
+        number, present = self._places[index]
+        return window_at(self._trajectories[number], present, self._history, self._future)

@@ -9,10 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
+from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.evaluation.memory import peak_megabytes
 from cconv.models.model import Model, ModelConfig
@@ -22,7 +24,7 @@ from cconv.ops.workers import torch_threads
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
 from cconv.tasks.features import FluidState, Inputs
-from cconv.tasks.task import FieldTask, as_field
+from cconv.tasks.task import FieldTask, StepTask, Task, as_field
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with
 
@@ -90,14 +92,14 @@ class AnalyticCost:
 def measure_costs(
     models: Mapping[str, Path],
     load: Callable[[Path], Model],
-    frames: Sequence[Frame],
+    frames: Sequence[Frame] | Sequence[Window],
     scene: Scene,
     *,
-    task: FieldTask,
+    task: Task,
     threads: int,
     repeats: int,
-) -> tuple[dict[str, Cost], AnalyticCost]:
-    """Measure the cost of each model and of the analytic field on the same frames.
+) -> tuple[dict[str, Cost], AnalyticCost | None]:
+    """Measure the cost of each model and of the analytic field, if the task is one, on the same frames.
 
     They take turns, so that a change of the machine's speed affects all of them alike. Each turn has a random order,
     and the first one is a warm-up.
@@ -105,15 +107,16 @@ def measure_costs(
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
-        frames: Frames to predict, in turn.
+        frames: Frames, or windows of a step task, to predict from in turn.
         scene: Their scene.
-        task: Task that names the analytic field.
+        task: Task of the models.
         threads: Number of torch threads.
         repeats: Timed predictions of each model, at least 2.
     """
     loaded = {name: load(path) for name, path in models.items()}
     calls = {name: _model_call(model, frames, scene) for name, model in loaded.items()}
-    calls[ANALYTIC] = _analytic_call(task, frames, scene)
+    if isinstance(task, FieldTask):
+        calls[ANALYTIC] = _analytic_call(task, frames, scene)
     with torch_threads(threads):
         times = _times_in_turn(calls, repeats)
     peaks = peak_megabytes(load, models, frames[0], scene, threads)
@@ -130,7 +133,8 @@ def measure_costs(
             threads=threads,
             num_particles=particles,
         )
-    return costs, AnalyticCost(**_medians(times[ANALYTIC]), turns_ms=_turns(times[ANALYTIC]))
+    analytic = times.get(ANALYTIC)
+    return costs, None if analytic is None else AnalyticCost(**_medians(analytic), turns_ms=_turns(analytic))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,17 +292,19 @@ def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tu
     return {name: samples[1:] for name, samples in times.items()}
 
 
-def _model_call(model: Model, frames: Sequence[Frame], scene: Scene) -> Call:
+def _model_call(model: Model, frames: Sequence[Frame] | Sequence[Window], scene: Scene) -> Call:
     return lambda turn: _time_prediction(model, frames[turn % len(frames)], scene)
 
 
-def _analytic_call(task: FieldTask, frames: Sequence[Frame], scene: Scene) -> Call:
+def _analytic_call(task: FieldTask, frames: Sequence[Any], scene: Scene) -> Call:
     sums = CompiledSums(task.kernel_at(scene.particle_spacing, scene.dim))
     return lambda turn: _time_analytic(task, sums, frames[turn % len(frames)], scene)
 
 
 def _block_call(model: Model, size: int) -> Call:
     frame, scene = fluid_block(size, model.config)
+    if isinstance(model.task, StepTask):
+        return _model_call(model, [_at_constant_velocity(frame, scene, model.task.history)], scene)
     return _model_call(model, [frame], scene)
 
 
@@ -308,7 +314,24 @@ def _analytic_block_call(field: ModelConfig, size: int) -> Call:
     return _analytic_call(task, [frame], scene)
 
 
-def _time_prediction(model: Model, frame: Frame, scene: Scene) -> tuple[float, float]:
+def _at_constant_velocity(frame: Frame, scene: Scene, history: int) -> Window:
+    """Make the window of frames that end with a frame, before which its particles moved at a tenth of their velocity.
+
+    A cube of fluid with random velocities of a spacing per frame would otherwise have left its place.
+    """
+    times = torch.arange(1 - history, 1)[:, None, None]
+    return Window(
+        positions=frame.positions + 0.1 * scene.particle_spacing * times * frame.velocities,
+        future=frame.positions[None][:0],
+        masses=frame.masses,
+        particle_types=frame.particle_types,
+        boundary=frame.boundary,
+        trajectory=scene.name,
+        frame=history - 1,
+    )
+
+
+def _time_prediction(model: Model, frame: Frame | Window, scene: Scene) -> tuple[float, float]:
     """Time `predict_frame` outside the network and inside it."""
     marks = []
     hooks = [
@@ -336,7 +359,7 @@ def _time_analytic(task: FieldTask, sums: CompiledSums, frame: Frame, scene: Sce
     return middle - start, time.perf_counter() - middle
 
 
-def _num_fluid(frame: Frame) -> int:
+def _num_fluid(frame: Frame | Window) -> int:
     return int((frame.particle_types == ParticleType.FLUID).sum())
 
 

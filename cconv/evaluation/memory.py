@@ -10,13 +10,14 @@ from pathlib import Path
 import torch
 
 from cconv.data.trajectory import Frame, Scene
+from cconv.data.window import Window
 from cconv.models.model import Model
 
 Load = Callable[[Path], Model]
 
 
 def peak_megabytes(
-    load: Load, models: Mapping[str, Path], frame: Frame, scene: Scene, threads: int
+    load: Load, models: Mapping[str, Path], frame: Frame | Window, scene: Scene, threads: int
 ) -> dict[str, float]:
     """Measure how much two predictions of each model add to the peak memory of a fresh process, MB.
 
@@ -32,7 +33,7 @@ def peak_megabytes(
     return dict(zip(models, found, strict=True))
 
 
-def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame, scene: Scene, threads: int) -> list[float]:
+def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame | Window, scene: Scene, threads: int) -> list[float]:
     """Run one process after another, one for each model, forked from this one so that imports happen once."""
     context, found = get_context("fork"), []
     for path in paths:
@@ -45,7 +46,7 @@ def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame, scene: Scene, th
     return found
 
 
-def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame, scene: Scene, threads: int) -> None:
+def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame | Window, scene: Scene, threads: int) -> None:
     torch.set_num_threads(threads)
     model = load(path)
     before = _peak_resident_megabytes()

@@ -256,7 +256,6 @@ def build_model(
     walls = (given.wall_kinds if WALLS in features else None) or Kinds(0, 0)
     names = {CONSTANT, *features}
     task.check_features(names)
-    names -= _absent(task, names, train_samples)
     config = ModelConfig(
         task=task.name,
         kernel=task.kernel,
@@ -279,7 +278,7 @@ def build_model(
     return Model(config, standardization, targets, generator)
 
 
-def _absent(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:
+def absent_features(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:
     """Optional features that are 0 in all samples, or that none has, such as a force in a scene without one."""
     unseen = {name for name in names if name in task.optional and name != WALLS}
     for sample in samples:

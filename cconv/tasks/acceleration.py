@@ -25,6 +25,7 @@ class Acceleration(StepTask):
     """
 
     name = "acceleration"
+    symbol = "a"
     meaning = (
         "The change of each particle's displacement from one stored frame to the next, from which the next frame "
         "follows; a model is rolled out by its own answers."
@@ -32,6 +33,7 @@ class Acceleration(StepTask):
     output = Kinds(0, 1)
     features = (CONSTANT, DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, VELOCITY, WALLS)
     optional = (DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, WALLS)
+    checks = ("completion", "motion", "packing")
     integrator = SemiImplicitEuler()
 
     def unit(self, units: Units) -> float:

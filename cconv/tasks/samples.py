@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cconv.data.dataset import Dataset
 from cconv.data.trajectory import Frame, Scene
-from cconv.data.window import Window, windows
+from cconv.data.window import Window, Windows
 from cconv.errors import check_choice
 from cconv.tasks.features import Inputs, make_inputs
 from cconv.tasks.task import FieldTask, StepTask, Task, as_field
@@ -127,12 +127,8 @@ def window_samples(dataset: Dataset, split: str, task: StepTask, future: int, st
         DataError: If a trajectory is too short for a single window.
     """
     check_choice("split", split, dataset.splits)
-    found = [
-        window
-        for trajectory in dataset.trajectories(split)
-        for window in windows(trajectory, task.history, future, stride)
-    ]
-    return WindowSamples(found, dataset.scene, task)
+    windows = Windows(dataset.trajectories(split), task.history, future, stride)
+    return WindowSamples(windows, dataset.scene, task)
 
 
 def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HORIZON) -> Iterable[Sample]:

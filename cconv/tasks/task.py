@@ -41,6 +41,7 @@ class Task(ABC):
     """
 
     name: ClassVar[str]
+    symbol: ClassVar[str]  # of the answer, for charts
     meaning: ClassVar[str]  # of the answer, a sentence for readers
     objective: ClassVar[str]  # what models are compared by, of `cconv.evaluation.objectives`
     output: ClassVar[Kinds]
@@ -112,7 +113,6 @@ class Task(ABC):
 class FieldTask(Task):
     """A field that analytic SPH gives as a function of the present frame."""
 
-    symbol: ClassVar[str]  # of the field, for charts
     objective = "normalized_mse"
     features = (CONSTANT, DENSITY, VELOCITY, WALLS)
     optional = (WALLS, DENSITY)
@@ -148,7 +148,6 @@ class StepTask(Task):
 
     integrator: ClassVar[Integrator]
     objective = "rollout_mse"
-    checks = ()
     histories = (2, 20)
 
     history: int = 6

@@ -11,7 +11,7 @@ from contracts.registered import registered
 from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
 from cconv.data.hdf5 import write_dataset
-from cconv.data.window import windows
+from cconv.data.window import Windows
 from cconv.domain import Box
 from cconv.evaluation.rollout_metrics import squared_errors
 from cconv.rollout.rollout import advance
@@ -160,7 +160,7 @@ def test_a_field_moves_with_the_scene(task, dataset, generator):
 def test_a_rollout_of_targets_is_the_stored_trajectory(dataset):
     """The law of integrators, for walls and lids too, which move as prescribed."""
     scene, trajectory = dataset.scene, dataset.trajectory("train", 0)
-    euler, (start, *_) = SemiImplicitEuler(), windows(trajectory, 2, len(trajectory) - 2)
+    euler, (start, *_) = SemiImplicitEuler(), Windows([trajectory], 2, len(trajectory) - 2)
     replayed = islice(advance(euler.target, euler, start, scene), len(start.future))
     positions = torch.stack([window.present for window in replayed])
     assert squared_errors(positions, start.future, scene.box).sqrt().max() < 1e-5 * scene.particle_spacing

@@ -4,13 +4,13 @@ import pytest
 import torch
 from systems import periodic_trajectory
 
-from cconv.data.window import window_at, windows
+from cconv.data.window import Windows, window_at
 from cconv.errors import DataError
 
 
 def test_windows_follow_each_other_frame_by_frame(generator):
     trajectory = periodic_trajectory(generator, num_frames=7)
-    cut = list(windows(trajectory, history=3, future=2))
+    cut = list(Windows([trajectory], history=3, future=2))
     assert [window.frame for window in cut] == [2, 3, 4]
     for window, later in zip(cut, cut[1:], strict=False):
         assert torch.equal(window.followed_by(window.future[0]).positions, later.positions)
@@ -18,7 +18,7 @@ def test_windows_follow_each_other_frame_by_frame(generator):
 
 def test_windows_of_lagrange_bench_do_not_overlap(generator):
     trajectory = periodic_trajectory(generator, num_frames=11)
-    cut = list(windows(trajectory, history=3, future=2, stride=5))
+    cut = list(Windows([trajectory], history=3, future=2, stride=5))
     frames = torch.cat([torch.cat([window.positions, window.future]) for window in cut])
     assert torch.equal(frames, trajectory.positions[: len(frames)])
     assert len(cut) == 2
@@ -40,4 +40,4 @@ def test_a_window_beyond_the_trajectory_is_refused(present, history, future, gen
 
 def test_a_trajectory_that_is_too_short_is_refused_before_the_first_window(generator):
     with pytest.raises(DataError, match="4 frames, too few for a window of 6 and 1 after it"):
-        windows(periodic_trajectory(generator, num_frames=4), 6, 1)
+        Windows([periodic_trajectory(generator, num_frames=4)], 6, 1)

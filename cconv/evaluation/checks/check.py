@@ -4,12 +4,9 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 
 from torch import Tensor
-
-from cconv.evaluation.checks.material import Material
-from cconv.evaluation.checks.predictor import Predictor
 
 NOT_FINITE = 1e9  # stands for infinity and NaN, which JSON files cannot hold
 
@@ -38,7 +35,11 @@ class Finding:
         return self.value <= self.limit
 
 
-class Check(ABC):
+MaterialT = TypeVar("MaterialT")
+PredictorT = TypeVar("PredictorT")
+
+
+class Check(ABC, Generic[MaterialT, PredictorT]):
     """A requirement on the models of a task; its frames are prepared once for all models.
 
     Attributes:
@@ -48,7 +49,7 @@ class Check(ABC):
         limit: Largest value that passes.
 
     Args:
-        material: Frames with their analytic answers.
+        material: What models are checked on: frames with their analytic answers, or starts of rollouts.
     """
 
     name: ClassVar[str]
@@ -56,11 +57,11 @@ class Check(ABC):
     failure: ClassVar[str]
     limit: ClassVar[float]
 
-    def __init__(self, material: Material):
+    def __init__(self, material: MaterialT):
         self.material = material
 
     @abstractmethod
-    def findings(self, predictor: Predictor) -> list[Finding]:
+    def findings(self, predictor: PredictorT) -> list[Finding]:
         """Measure a predictor; labels and their order are the same for all predictors."""
 
     def description(self) -> str:
@@ -71,9 +72,10 @@ class Check(ABC):
         """Describe a finding beyond the limit in one line."""
         return self.failure.format(**vars(finding))
 
-    def _finding(self, label: str, value: Tensor | float, detail: str = "") -> Finding:
+    def _finding(self, label: str, value: Tensor | float, detail: str = "", limit: float | None = None) -> Finding:
         finite = float(value) if math.isfinite(value) else NOT_FINITE
-        return Finding(check=self.name, label=label, value=finite, limit=self.limit, detail=detail)
+        largest = self.limit if limit is None else limit
+        return Finding(check=self.name, label=label, value=finite, limit=largest, detail=detail)
 
 
 def worst_of_each_label(findings: Iterable[Finding]) -> list[Finding]:

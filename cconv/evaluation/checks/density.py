@@ -13,7 +13,7 @@ FRAMES = 30  # of a trajectory that the rate is integrated over
 USUAL = 0.95  # share of the particles whose density must keep the limit
 
 
-class IntegratedDensity(Check):
+class IntegratedDensity(Check[Material, Predictor]):
     r"""Relative deviation of the density that follows from integrating a predicted rate over stored frames.
 
     The analytic rate is exactly the derivative of the summed density (`cconv.sph.density_rate`), so that integrated

@@ -71,6 +71,11 @@ class Material:
     fastest: float
     reach: float
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of frames that are looked at, for a reader."""
+        return {"plain_frames": len(self.plain), "stressed_frames": len(self.few)}
+
     @cached_property
     def stressed(self) -> tuple[Probe, ...]:
         """Return the few frames, each in every perturbed state."""

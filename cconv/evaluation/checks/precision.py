@@ -3,12 +3,12 @@
 import math
 
 from cconv.evaluation.checks.check import Check, Finding, worst_of_each_label
-from cconv.evaluation.checks.material import Probe
+from cconv.evaluation.checks.material import Material, Probe
 from cconv.evaluation.checks.predictor import Predictor
 from cconv.evaluation.checks.states import AS_IT_IS, FAR_AWAY
 
 
-class Precision(Check):
+class Precision(Check[Material, Predictor]):
     """Largest difference between predictions in float32 and float64 ÷ standard deviation of the target."""
 
     name = "precision"

@@ -36,7 +36,7 @@ class Regime:
         return float(self.members.double().mean())
 
 
-class Regimes(Check):
+class Regimes(Check[Material, Predictor]):
     """Mean squared error of the particles of each regime ÷ its scale."""
 
     name = "regimes"

@@ -2,24 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 from cconv.evaluation.checks.check import Check, Finding
-from cconv.evaluation.checks.material import Material
-from cconv.evaluation.checks.predictor import Predictor
 
 
-def measure_stability(seeds: Mapping[str, Predictor], checks: Sequence[Check], material: Material) -> dict:
+def measure_stability(seeds: Mapping[str, Any], checks: Sequence[Check], counts: Mapping[str, int]) -> dict:
     """Run all checks on all seeds of a model.
 
     Args:
         seeds: Each training of the model, by name.
         checks: The checks to run.
-        material: The frames that the checks were made with.
+        counts: Numbers of frames or rollouts that the checks look at.
 
     Returns:
         "stable", whether all seeds keep every limit; "findings", those of the worst seed for each check and label;
         "failures", one line for each that is beyond its limit, with the seeds if there are several; "counts" of seeds
-        and of frames that were looked at.
+        and of what was looked at.
     """
     findings, failures = [], []
     for check in checks:
@@ -31,11 +30,7 @@ def measure_stability(seeds: Mapping[str, Predictor], checks: Sequence[Check], m
         "stable": not failures,
         "findings": findings,
         "failures": failures,
-        "counts": {
-            "seeds": len(seeds),
-            "plain_frames": len(material.plain),
-            "stressed_frames": len(material.few),
-        },
+        "counts": {"seeds": len(seeds), **counts},
     }
 
 

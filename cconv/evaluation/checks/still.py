@@ -11,7 +11,7 @@ from cconv.evaluation.checks.predictor import Predictor
 from cconv.evaluation.checks.states import State, oblique
 
 
-class StillStates(Check):
+class StillStates(Check[Material, Predictor]):
     """Mean square of a rate that should be 0 ÷ a tenth of the target's variance."""
 
     name = "still"

@@ -1,11 +1,11 @@
 """Check of the errors on perturbed frames: denser, faster, clumped, rotated or moved compared with the data."""
 
 from cconv.evaluation.checks.check import Check, Finding, worst_of_each_label
-from cconv.evaluation.checks.material import SCALED, relative_error
+from cconv.evaluation.checks.material import SCALED, Material, relative_error
 from cconv.evaluation.checks.predictor import Predictor
 
 
-class StressedStates(Check):
+class StressedStates(Check[Material, Predictor]):
     """Mean squared error in each perturbed state ÷ its scale, of the worst of the perturbed frames."""
 
     name = "stress"

@@ -12,7 +12,7 @@ from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.summary import CostModel, SearchPoint
 from cconv.study.records.trials import TrialRecord
 from cconv.study.running.problem import Problem
-from cconv.tasks.features import WALLS, kinds_of
+from cconv.tasks.features import WALLS
 
 FEWEST_MEASURED = 5  # models, the fewest for a check of the cost model
 
@@ -36,9 +36,10 @@ class CostCounter:
         Raises:
             ConfigError: If its cutoff is larger than the box allows.
         """
-        features, network, _ = configure(parameters, self._study.configuration)
+        configuration = configure(parameters, self._study.configuration)
+        features, network = self._problem.features_of(configuration), configuration.network
         return network.count(
-            kinds_of(features),
+            self._problem.task.kinds(features),
             self._inputs.wall_kinds if WALLS in features else None,
             self._problem.task.output,
             self._problem.scene.dim,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -11,7 +12,7 @@ from cconv.data.metadata import OVERRIDES
 from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
-from cconv.models.model import Model, build_model
+from cconv.models.model import Model, absent_features, build_model
 from cconv.study.declared.configuration import Configuration, TaskConfig, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
@@ -64,12 +65,22 @@ class Problem:
             raise ConfigError(f"`training.noise` must be 0 for the field {self.task.name!r}, got {training.noise:g}.")
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), seed)
 
+    @cached_property
+    def present_features(self) -> tuple[str, ...]:
+        """Features of the task that are not absent in this scene, such as a force where there is none."""
+        absent = absent_features(self.task, self.task.features, self.typical_samples)
+        return tuple(name for name in self.task.features if name not in absent)
+
+    def features_of(self, configuration: Configuration) -> tuple[str, ...]:
+        """Features that a network of a configuration is given in this scene."""
+        return tuple(name for name in configuration.features if name in self.present_features)
+
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """Build an untrained model with the initial weights of `init_seed`."""
         return build_model(
             configuration.network,
             self.task,
-            configuration.features,
+            self.features_of(configuration),
             self.scene,
             self.typical_samples,
             torch.Generator().manual_seed(init_seed),
@@ -137,7 +148,7 @@ def load_problem(
         scene=dataset.scene,
         task=study_task(study.task, dataset.scene),
         train_samples=train if isinstance(train, WindowSamples) else list(progress(train, "train")),
-        valid_samples=list(progress(valid, "valid")),
+        valid_samples=valid if isinstance(valid, WindowSamples) else list(progress(valid, "valid")),
     )
 
 

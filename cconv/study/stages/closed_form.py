@@ -34,6 +34,7 @@ from cconv.study.running.trial import Trial, describe
 from cconv.study.stages.jobs import trial_name
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
+from cconv.training.losses import LOSSES
 from cconv.validation import Value, Whole
 
 MOST_LAYERS = 50_000  # listed at most; a space may hold any number of single layers
@@ -60,7 +61,7 @@ class ClosedFormStage(Stage):
         are proposed from the records of the candidates before them.
         """
         layers = single_layers(session.space, session.study.network, self.values_per_range)
-        samples = self._screening_samples(session.problem)
+        screened = self._screening(session.problem)
         untried = {identity(layer): layer for layer in layers}
         batch = _draw(layers, (self.max_candidates + 1) // 2, session.seed_of(name))
         number = 0
@@ -70,7 +71,7 @@ class ClosedFormStage(Stage):
             affordable = [layer for layer in batch if session.affordable(layer)][: self.max_candidates - number]
             for layer in session.progress(affordable, "closed forms"):
                 folder = session.run.trial(trial_name(name, number))
-                _fit_and_record(session, layer, samples, folder, name, session.study.seeds.init, self.ridge)
+                _fit_and_record(session, layer, screened, folder, name, session.study.seeds.init, self.ridge)
                 number += 1
             batch = propose(self.winners(session, name), list(untried.values()))
         return Found()
@@ -81,12 +82,12 @@ class ClosedFormStage(Stage):
         cost = {record.id: record.config["flops_per_particle"] for record in records}
         return choose_finalists(records, cost, self.count, session.study.selection.accurate_enough)
 
-    def _screening_samples(self, problem: Problem) -> tuple[list[Sample], list[Sample]]:
+    def _screening(self, problem: Problem) -> tuple[list[int], list[Sample]]:
+        """Choose places of training samples, and validation samples, evenly spaced."""
         train, valid = (
-            [split[place] for place in evenly_spaced(len(split), self.screening_frames)]
-            for split in (problem.train_samples, problem.valid_samples)
+            evenly_spaced(len(split), self.screening_frames) for split in (problem.train_samples, problem.valid_samples)
         )
-        return train, valid
+        return train, [problem.valid_samples[place] for place in valid]
 
 
 def single_layers(space: SearchSpace, network: NetworkSettings, values_per_range: int) -> list[dict[str, Value]]:
@@ -219,20 +220,23 @@ def fit_whole(
     session: Session, parameters: Mapping[str, Value], folder: TrialFolder, stage: str, seed: int, ridge: float
 ) -> None:
     """Fit a layer to the whole training split and record its error on the whole validation split."""
-    samples = session.problem.train_samples, session.problem.valid_samples
+    samples = range(len(session.problem.train_samples)), session.problem.valid_samples
     _fit_and_record(session, parameters, samples, folder, stage, seed, ridge)
 
 
 def _fit_and_record(
     session: Session,
     parameters: Mapping[str, Value],
-    samples: tuple[Sequence[Sample], Sequence[Sample]],
+    samples: tuple[Sequence[int], Sequence[Sample]],
     folder: TrialFolder,
     stage: str,
     init_seed: int,
     ridge: float,
 ) -> None:
-    """Fit a layer to the first of `samples` and record its error on the second; no weight depends on the seed."""
+    """Fit a layer to the training samples at some places, and record its error on others.
+
+    No weight depends on the seed. With noise, each place gives one noisy sample.
+    """
     folder.check_begun_with(parameters)
     if folder.ended:
         return
@@ -244,10 +248,12 @@ def _fit_and_record(
     trial = Trial(stage=stage, parameters=parameters, provenance=provenance(study), **seeds)
     config = describe(problem, trial, model, untrained) | {"closed_form": True, "ridge": ridge}
     folder.start(config)
-    train, valid = samples
+    places, valid = samples
+    examples = problem.examples(configuration.training, study.seeds.data)
     start = time.perf_counter()
     try:
-        solve_closed_form(model, train, ridge)
+        drawn = (examples.draw(place, 0) for place in places)
+        solve_closed_form(model, drawn, ridge, weight=LOSSES[configuration.training.loss])
     except ConfigError as error:
         folder.finish("failed", str(error))
         return

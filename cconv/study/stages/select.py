@@ -12,12 +12,14 @@ import numpy as np
 
 from cconv.data.splits import evenly_spaced
 from cconv.evaluation.checks import make_checks
-from cconv.evaluation.checks.material import make_material
+from cconv.evaluation.checks.material import Material, make_material
 from cconv.evaluation.checks.predictor import ModelPredictor
+from cconv.evaluation.checks.rolled import RolloutMaterial, make_rollout_material
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
 from cconv.models.checkpoint import load_model
+from cconv.models.model import Model
 from cconv.study.declared.stage import BASELINE, Stage, reads_of
 from cconv.study.evidence.budget import budget_words
 from cconv.study.evidence.front import Timing, attainment, hypervolume_interval, timed_front
@@ -54,8 +56,8 @@ from cconv.study.stages.finalists import (
     retrained_finalists,
 )
 from cconv.study.stages.session import Session
-from cconv.tasks.samples import Sample
-from cconv.tasks.task import as_field
+from cconv.tasks.samples import Sample, WindowSamples
+from cconv.tasks.task import FieldTask, StepTask, as_field
 
 TIMED_FRAMES = 5
 GROWTH_REPEATS = 3
@@ -89,9 +91,10 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
     check_any_finished(run, finalists, failed)
     judged = _judge(session, finalists)
     growth = _growth(session, finalists)
-    samples = list(session.progress(study_samples(study, session.dataset, "test"), "test"))
+    samples = _test_samples(session)
     tests, test_errors = _errors(session, finalists, samples, "test errors")
-    explained = [each for each in finalists if each.id in (BASELINE, judged.chosen.id)]
+    is_field = isinstance(session.problem.task, FieldTask)
+    explained = [each for each in finalists if is_field and each.id in (BASELINE, judged.chosen.id)]
     _explain(run, explained, samples)
     _complete_cards(run, finalists, tests)
     mean, earlier = _mean_predictor(session, samples), _of_earlier_stages(session, stage)
@@ -123,6 +126,11 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
     )
 
 
+def _test_samples(session: Session) -> Sequence[Sample]:
+    samples = study_samples(session.study, session.dataset, "test")
+    return samples if isinstance(samples, WindowSamples) else list(session.progress(samples, "test"))
+
+
 def _complete_cards(run: RunFolder, finalists: Sequence[Retrained], tests: Mapping[str, Errors]) -> None:
     environment = run.read("environment.json")
     for finalist in finalists:
@@ -137,7 +145,7 @@ class _Judged:
         facts: Validation errors of each finalist.
         errors: The same errors as tables (seeds, units).
         costs: Cost of each finalist and of some trials.
-        analytic: Cost of the analytic field, timed in turn with them.
+        analytic: Cost of the analytic field, timed in turn with them; None for steps.
         times: Time of each finalist.
         checks: Description of each check of stability, by name.
         stability: Findings of the checks in each finalist.
@@ -148,7 +156,7 @@ class _Judged:
     facts: dict[str, Errors]
     errors: dict[str, np.ndarray]
     costs: dict[str, Cost]
-    analytic: AnalyticCost
+    analytic: AnalyticCost | None
     times: dict[str, Timing]
     checks: dict[str, str]
     stability: dict[str, Stability]
@@ -212,7 +220,7 @@ def _mean_predictor(session: Session, test_samples: Sequence[Sample]) -> MeanPre
     )
 
 
-def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost]:
+def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, Cost], AnalyticCost | None]:
     """Time in turn the finalists, some trials from the cheapest to the costliest, and the analytic field."""
     settings, run, problem = session.study.cost, session.run, session.problem
     checkpoints = {finalist.id: finalist.best_checkpoint for finalist in finalists}
@@ -220,17 +228,25 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
     trials.sort(key=lambda record: record.config["flops_per_particle"])
     chosen = [trials[place] for place in evenly_spaced(len(trials), settings.trials)] if trials else []
     checkpoints |= {record.id: run.trial(record.id).checkpoint for record in chosen}
-    frames = list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
+    frames = _timed_frames(session)
     costs, analytic = measure_costs(
         checkpoints,
         load_model,
         frames,
         session.dataset.scene,
-        task=as_field(problem.task),
+        task=problem.task,
         threads=settings.threads,
         repeats=settings.repeats,
     )
-    return costs, AnalyticCost.model_validate(analytic, from_attributes=True)
+    return costs, None if analytic is None else AnalyticCost.model_validate(analytic, from_attributes=True)
+
+
+def _timed_frames(session: Session) -> list[Any]:
+    """Choose what models are timed on: the first validation frames, or the windows that rollouts begin with."""
+    samples = session.problem.valid_samples
+    if isinstance(samples, WindowSamples):
+        return list(samples.windows[:TIMED_FRAMES])
+    return list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
@@ -241,7 +257,9 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
     grown = measure_growth(
         checkpoints,
         load_model,
-        analytic=load_model(finalists[0].best_checkpoint).config,
+        analytic=None
+        if isinstance(session.problem.task, StepTask)
+        else load_model(finalists[0].best_checkpoint).config,
         sizes=sizes,
         threads=settings.threads,
         repeats=GROWTH_REPEATS,
@@ -264,24 +282,31 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
     """
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
-    reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    material = make_material(trajectories, scene, as_field(problem.task), reach)
+    material: Material | RolloutMaterial
+    predictor: Callable[[Model], Any]
+    if isinstance(problem.task, StepTask):
+        material, predictor = make_rollout_material(trajectories, scene, problem.task), lambda model: model
+    else:
+        reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
+        material, predictor = make_material(trajectories, scene, as_field(problem.task), reach), ModelPredictor
     checks = make_checks(material)
     found = {
-        finalist.id: Stability(**measure_stability(_predictors(finalist), checks, material))
+        finalist.id: Stability(**measure_stability(_of_seeds(finalist, predictor), checks, material.counts))
         for finalist in session.progress(finalists, "stability")
     }
     return {check.name: check.description() for check in checks}, found
 
 
-def _predictors(finalist: Retrained) -> dict[str, ModelPredictor]:
-    """Make a predictor of every training of a finalist, by the name of the training."""
+def _of_seeds(finalist: Retrained, predictor: Callable[[Model], Any]) -> dict[str, Any]:
+    """Make what checks test of every training of a finalist, by the name of the training."""
     trained = zip(finalist.records, finalist.checkpoints, strict=True)
-    return {record.id: ModelPredictor(load_model(checkpoint)) for record, checkpoint in trained}
+    return {record.id: predictor(load_model(checkpoint)) for record, checkpoint in trained}
 
 
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
     """Save the filters, a predicted test frame and the error distribution of some finalists, for the report."""
+    if not finalists:
+        return
     folder = run.path / "explanation"
     folder.mkdir(exist_ok=True)
     first = [sample for sample in samples if sample.trajectory == samples[0].trajectory]
@@ -336,7 +361,7 @@ def _task(session: Session) -> TaskFacts:
     task, objective = session.problem.task, session.problem.objective
     return TaskFacts(
         name=task.name,
-        symbol=as_field(task).symbol,
+        symbol=task.symbol,
         meaning=task.meaning,
         error=objective.label,
         error_meaning=objective.meaning,

@@ -80,7 +80,7 @@ def test_a_trajectory_at_rest_is_judged_too():
     checks = make_checks(material)
     faults = {"truth": lambda field, *others: field, "constant": lambda field, *others: field + 1}
     stable = {
-        name: measure_stability({"it": spoiled(material, fault)}, checks, material)["stable"]
+        name: measure_stability({"it": spoiled(material, fault)}, checks, material.counts)["stable"]
         for name, fault in faults.items()
     }
     assert stable == {"truth": True, "constant": False}

@@ -27,7 +27,7 @@ def truth(field, *others):
 def measured(material, **faults):
     """Stability of analytic SPH with a fault in each seed."""
     seeds = {name: spoiled(material, fault) for name, fault in faults.items()}
-    return measure_stability(seeds, make_checks(material), material)
+    return measure_stability(seeds, make_checks(material), material.counts)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_an_untrained_model_is_not_stable():
     samples = [make_sample(frame, scene, material.task) for frame in trajectory]
     network = configured(layers=2, first_channels=4, hidden_channels=4)
     model = model_of(network, scene, "density_rate", samples, torch.Generator().manual_seed(0))
-    found = measure_stability({"it": ModelPredictor(model)}, make_checks(material), material)
+    found = measure_stability({"it": ModelPredictor(model)}, make_checks(material), material.counts)
     assert not found["stable"]
     assert any("regime bulk" in line for line in found["failures"])
     assert any("frame as_it_is" in line for line in found["failures"])
