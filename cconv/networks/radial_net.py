@@ -233,7 +233,7 @@ class RadialNetSettings(ConvolutionSettings):
 
     is_equivariant = True
     basis_size = "radial_terms"
-    linear_settings = (*ConvolutionSettings.linear_settings, basis_size)
+    linear_settings = (*ConvolutionSettings.linear_settings, basis_size, "conserves_momentum")
 
     architecture: Literal["radial_net"] = "radial_net"
     radial_terms: Whole = Field(16, ge=1, le=512)

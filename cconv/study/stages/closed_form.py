@@ -23,7 +23,14 @@ from cconv.models.checkpoint import save_model
 from cconv.models.closed_form import solve_closed_form
 from cconv.networks import ARCHITECTURES
 from cconv.networks.network import NetworkSettings
-from cconv.study.declared.configuration import ARCHITECTURE, NETWORK, OPTIONAL_FEATURES, configure, feature_path
+from cconv.study.declared.configuration import (
+    ARCHITECTURE,
+    NETWORK,
+    OPTIONAL_FEATURES,
+    TRAINING,
+    configure,
+    feature_path,
+)
 from cconv.study.declared.domains import Choice, Parameter, SearchSpace
 from cconv.study.declared.stage import Ridge, Stage, reads_of
 from cconv.study.evidence.recommendation import choose_finalists
@@ -127,7 +134,8 @@ def _paths(settings: Mapping[str, Value]) -> dict[str, Value]:
 
 def _applies(settings: type[NetworkSettings]) -> set[str]:
     """List the paths of the hyperparameters that a single layer of an architecture has."""
-    return {*(f"{NETWORK}.{name}" for name in settings.linear_settings), *map(feature_path, OPTIONAL_FEATURES)}
+    of_network = (f"{NETWORK}.{name}" for name in settings.linear_settings)
+    return {*of_network, *map(feature_path, OPTIONAL_FEATURES), f"{TRAINING}.noise", f"{TRAINING}.loss"}
 
 
 def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:
