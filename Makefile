@@ -1,4 +1,5 @@
 # make study   environment, data, the quick study, report
+# make rollout the same for steps that are rolled out: data, the study rollout, a rollout of the recommended model
 # make test-fast   environment, the tests that start no processes: laws and formats, a minute or two
 # make test    environment, whole test suite, on all cores
 # make test-slow   what takes hours: clusters, kills, cold compilation, a thousand inputs
@@ -11,11 +12,18 @@ STUDY ?= experiments/quick.toml
 ON_ALL_CORES := -n logical --maxprocesses 8 --dist worksteal
 RUN ?= runs/$(basename $(notdir $(STUDY)))
 DATA := runs/data/dam_break_2d
+VORTICES := runs/data/taylor_green_2d
+ROLLED := runs/rollout
 
-.PHONY: study test test-fast test-slow check data clean
+.PHONY: study rollout test test-fast test-slow check data clean
 
 study: $(VENV)/.installed $(DATA)/metadata.json
 	$(VENV)/bin/cconv study run $(STUDY) --data $(DATA) --out $(RUN) --overwrite
+
+rollout: $(VENV)/.installed $(VORTICES)/metadata.json
+	$(VENV)/bin/cconv study run experiments/rollout.toml --data $(VORTICES) --out $(ROLLED) --overwrite
+	rm -rf $(ROLLED)/rollouts
+	$(VENV)/bin/cconv rollout $(ROLLED) --out $(ROLLED)/rollouts
 
 test: $(VENV)/.installed
 	$(VENV)/bin/pytest $(ON_ALL_CORES)
@@ -36,6 +44,10 @@ data: $(DATA)/metadata.json
 $(DATA)/metadata.json: $(VENV)/.installed
 	$(VENV)/bin/cconv data generate dam_break_2d --size small --trajectories 20 --frames 13 \
 		--steps-per-frame 210 --out $(DATA) --overwrite
+
+$(VORTICES)/metadata.json: $(VENV)/.installed
+	$(VENV)/bin/cconv data generate taylor_green_2d --size small --trajectories 12 --frames 61 \
+		--out $(VORTICES) --overwrite
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)

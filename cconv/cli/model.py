@@ -89,7 +89,7 @@ def fit(
     model = problem.build_model(config.configuration, config.seeds.init)
     training = config.training
     examples = problem.examples(training, config.seeds.data)
-    samples = (examples.draw(index, 0) for index in show_progress(range(len(examples)), "fit"))
+    samples = (examples.draw(index, 0, model) for index in show_progress(range(len(examples)), "fit"))
     solve_closed_form(model, samples, ridge, weight=LOSSES[training.loss])
     error = problem.objective.error(model, show_progress(problem.valid_samples, "validate"))
     card = {

@@ -21,7 +21,11 @@ LONGEST_ANIMATION = 60  # frames; longer rollouts are drawn every few frames
 
 def rollout(
     checkpoint: Annotated[
-        Path, typer.Argument(metavar="CHECKPOINT", help="Checkpoint folder of a model of the task acceleration.")
+        Path,
+        typer.Argument(
+            metavar="CHECKPOINT",
+            help="Checkpoint folder of a model of the task acceleration, or a run folder: its recommended model.",
+        ),
     ],
     data: DataPath = None,
     split: Annotated[str, typer.Option(help="Split of the trajectory: train, valid or test.")] = "test",
@@ -61,6 +65,7 @@ def rollout(
         raise ConfigError("`--vtk` writes to DIR/vtk and needs `--out DIR`.")
     if frames is not None and frames < 1:
         raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
+    checkpoint = _recommended(checkpoint)
     model, card = load_model(checkpoint), read_card(checkpoint)
     history = as_step(model.task).history
     given = {
@@ -89,6 +94,15 @@ def rollout(
         _print(facts, out)
     if recorded.ended is not None:
         raise typer.Exit(130 if recorded.ended == "interrupted" else 1)
+
+
+def _recommended(path: Path) -> Path:
+    """Return the checkpoint of the recommended model of a run folder; another folder as it is."""
+    from cconv.study.records.run_folder import RunFolder
+
+    if not (path / "summary.json").is_file():
+        return path
+    return path / RunFolder.open(path).summary().chosen.checkpoint
 
 
 def _warn_of_spacing(found: float, trained: float) -> None:

@@ -112,14 +112,17 @@ class Windows(Sequence[Window]):
         history: Frames up to the present, H.
         future: Frames after it, F.
         stride: Frames from one present to the next.
+        further: Frames after those, as many as are stored.
 
     Raises:
         DataError: If a trajectory is too short for a single one.
     """
 
-    def __init__(self, trajectories: Iterable[Trajectory], history: int, future: int, stride: int = 1):
+    def __init__(
+        self, trajectories: Iterable[Trajectory], history: int, future: int, stride: int = 1, further: int = 0
+    ):
         self._trajectories = list(trajectories)
-        self._history, self._future = history, future
+        self._history, self._future, self._further = history, future, further
         self._places = [
             (number, present)
             for number, trajectory in enumerate(self._trajectories)
@@ -143,4 +146,6 @@ class Windows(Sequence[Window]):
             some._places = self._places[index]
             return some
         number, present = self._places[index]
-        return window_at(self._trajectories[number], present, self._history, self._future)
+        trajectory = self._trajectories[number]
+        future = min(self._future + self._further, len(trajectory) - present - 1)
+        return window_at(trajectory, present, self._history, future)

@@ -113,6 +113,22 @@ class WindowSamples(Sequence[StepSample]):
         return list(self[:: math.ceil(len(self) / MOST_SPREAD)])
 
 
+def learned_samples(dataset: Dataset, split: str, task: StepTask, further: int = 0) -> WindowSamples:
+    """Samples of all windows of a split that have a next frame, to learn from.
+
+    Args:
+        dataset: Data set.
+        split: Usually "train".
+        task: What is asked.
+        further: Frames after the next one that each window has too, as far as they are stored.
+
+    Raises:
+        DataError: If a trajectory is too short for a single window.
+    """
+    check_choice("split", split, dataset.splits)
+    return WindowSamples(Windows(dataset.trajectories(split), task.history, 1, further=further), dataset.scene, task)
+
+
 def window_samples(dataset: Dataset, split: str, task: StepTask, future: int, stride: int) -> WindowSamples:
     """Samples of the windows of a split, in order.
 

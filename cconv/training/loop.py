@@ -109,7 +109,7 @@ def train(
     for update, indices in enumerate(order, start=progress.updates + 1):
         rate = optimization.rate_at(update)
         progress.optimizer.param_groups[0]["lr"] = rate
-        batch = [examples.draw(index, update) for index in indices]
+        batch = [examples.draw(index, update, model) for index in indices]
         loss = _update(model, batch, progress.optimizer, geometry, optimization.loss)
         valid = None
         if math.isfinite(loss) and optimization.is_evaluated(update):

@@ -1,6 +1,7 @@
 """The random walk of Sanchez-Gonzalez et al. (2020): its size, where it begins, and what it asks of a model."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import torch
 from systems import periodic_frame, periodic_scene, window_of
@@ -10,9 +11,11 @@ from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, StoredExamples
+from cconv.training.unroll import Pushforward
 
 TASK, SCENE = task_named("acceleration"), periodic_scene(40)
-NOISE = RandomWalkNoise(0.05)
+NOISE, NEVER = RandomWalkNoise(0.05), Pushforward(0, 0)
+MODEL = SimpleNamespace(task=TASK, predict_frame=TASK.target)
 
 
 def noisy_and_clean(generator):
@@ -52,9 +55,9 @@ def test_noise_differs_between_updates_and_not_between_runs(generator):
     scene = periodic_scene()
     windows = [window_of(periodic_frame(generator), generator) for _ in range(2)]
     samples = WindowSamples(windows, scene, TASK)
-    examples, again = (AugmentedExamples(samples, NOISE, seed=3) for _ in range(2))
-    first = examples.draw(0, update=5)
-    assert torch.equal(first.target, again.draw(0, update=5).target)
-    assert not torch.equal(first.target, examples.draw(0, update=6).target)
-    assert not torch.equal(first.target, AugmentedExamples(samples, NOISE, seed=4).draw(0, update=5).target)
-    assert torch.equal(StoredExamples(samples).draw(1, update=9).target, samples[1].target)
+    examples, again = (AugmentedExamples(samples, NOISE, NEVER, seed=3) for _ in range(2))
+    first = examples.draw(0, 5, MODEL)
+    assert torch.equal(first.target, again.draw(0, 5, MODEL).target)
+    assert not torch.equal(first.target, examples.draw(0, 6, MODEL).target)
+    assert not torch.equal(first.target, AugmentedExamples(samples, NOISE, NEVER, seed=4).draw(0, 5, MODEL).target)
+    assert torch.equal(StoredExamples(samples).draw(1, 9, MODEL).target, samples[1].target)

@@ -16,9 +16,9 @@ class Motion(SeriesCheck):
     name = "motion"
     sentence = (
         "Kinetic energy of a rollout divided by that of the stored frame (after the last one, by the largest of the "
-        "second half), and the inverse, energies below a hundredth of the largest counted as that; drift of the momentum relative to the "
-        "sum of the initial magnitudes, where there are no walls and no force; largest displacement in a frame, in "
-        "particle spacings."
+        "second half), and the inverse, energies below a hundredth of the largest counted as that; drift of the "
+        "momentum relative to the sum of the initial magnitudes, where there are no walls and no force; largest "
+        "displacement in a frame, in particle spacings."
     )
     failure = "{label} {value:.3g} (limit {limit:.3g}; {detail})"
     bounds = {

@@ -16,6 +16,7 @@ from cconv.tasks.task import StepTask
 from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
+MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns from
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
@@ -23,7 +24,7 @@ _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for nam
 HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
-    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "noise")),
+    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "noise", "pushforward")),
 )
 
 Settings = TypeVar("Settings", bound=StrictModel)
@@ -84,7 +85,9 @@ class TrainingConfig(StrictModel):
     """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
 
     `loss` says how much each frame counts. `noise`, for step tasks, is the standard deviation of the random walk that
-    is added to the velocities of a window, in particle spacings per frame.
+    is added to the velocities of a window, in particle spacings per frame. `pushforward` is the largest number of steps
+    that the model's own rollout goes on before the step that it learns from, once a share `pushforward_from` of the
+    updates is done.
     """
 
     updates: Updates = 600
@@ -94,7 +97,14 @@ class TrainingConfig(StrictModel):
     schedule: Literal["constant", "cosine", "exponential"] = "cosine"
     loss: Literal["mse", "balanced_mse"] = "mse"
     noise: Real = Field(0.0, ge=0, le=1)
+    pushforward: Whole = Field(0, ge=0, le=MOST_PUSHED)
+    pushforward_from: Real = Field(0.5, ge=0, le=1)
     cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
+
+    @property
+    def moves_particles(self) -> bool:
+        """Whether windows are changed before a network learns from them, so that no geometry serves twice."""
+        return self.noise > 0 or self.pushforward > 0
 
 
 class Configuration(NamedTuple):

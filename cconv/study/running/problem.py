@@ -13,13 +13,14 @@ from cconv.data.trajectory import Scene
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.model import Model, absent_features, build_model
-from cconv.study.declared.configuration import Configuration, TaskConfig, TrainingConfig
+from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TaskConfig, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
-from cconv.tasks.samples import HORIZON, Sample, WindowSamples, compared_samples, window_samples
+from cconv.tasks.samples import HORIZON, Sample, WindowSamples, compared_samples, learned_samples
 from cconv.tasks.task import StepTask, Task
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
+from cconv.training.unroll import Pushforward
 from cconv.validation import PathText, check_setting, validated
 
 
@@ -54,16 +55,20 @@ class Problem:
         return self.objective.error(model, self.valid_samples, geometry)
 
     def examples(self, training: TrainingConfig, seed: int) -> Examples:
-        """Make the examples of a training, with its noise.
+        """Make the examples of a training, with its noise and pushforward.
 
         Raises:
-            ConfigError: If noise is asked for where there is no window to add it to.
+            ConfigError: If one of them is asked for where there are no windows.
         """
-        if not training.noise:
+        if not training.moves_particles:
             return StoredExamples(self.train_samples)
         if not isinstance(self.train_samples, WindowSamples):
-            raise ConfigError(f"`training.noise` must be 0 for the field {self.task.name!r}, got {training.noise:g}.")
-        return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), seed)
+            raise ConfigError(
+                f"`training.noise` and `training.pushforward` must be 0 for the field {self.task.name!r}, got "
+                f"{training.noise:g} and {training.pushforward}."
+            )
+        pushforward = Pushforward(training.pushforward, round(training.pushforward_from * training.updates))
+        return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)
 
     @cached_property
     def present_features(self) -> tuple[str, ...]:
@@ -122,7 +127,7 @@ def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[
     """Make the samples of a split for the task of a study, of the training split those to learn from."""
     task = study_task(study.task, dataset.scene)
     if isinstance(task, StepTask) and split == "train":
-        return window_samples(dataset, split, task, future=1, stride=1)
+        return learned_samples(dataset, split, task, further=MOST_PUSHED)
     return compared_samples(dataset, split, task, study.task.horizon or HORIZON)
 
 

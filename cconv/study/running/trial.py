@@ -69,9 +69,9 @@ def run_trial(
         model,
         problem.examples(training, trial.data_seed),
         problem.valid_error,
-        Optimization(**training.model_dump(exclude={"cache_megabytes", "noise"})),
+        Optimization(**training.model_dump(exclude={"cache_megabytes", "noise", "pushforward", "pushforward_from"})),
         data_seed=trial.data_seed,
-        cache_bytes=0 if training.noise else training.cache_megabytes * 2**20,  # noise moves the particles
+        cache_bytes=0 if training.moves_particles else training.cache_megabytes * 2**20,
         progress=progress,
     )
     try:

@@ -260,7 +260,7 @@ def _fit_and_record(
     examples = problem.examples(configuration.training, study.seeds.data)
     start = time.perf_counter()
     try:
-        drawn = (examples.draw(place, 0) for place in places)
+        drawn = (examples.draw(place, 0, model) for place in places)
         solve_closed_form(model, drawn, ridge, weight=LOSSES[configuration.training.loss])
     except ConfigError as error:
         folder.finish("failed", str(error))

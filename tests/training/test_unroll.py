@@ -1,0 +1,58 @@
+"""Pushforward: a model learns to come back from where its own rollout leads."""
+
+import pytest
+import torch
+from systems import configured, model_of, periodic_frame, periodic_scene, window_of
+
+from cconv.rollout.rollout import rollout
+from cconv.tasks import task_named
+from cconv.tasks.samples import WindowSamples
+from cconv.training.augmentation import RandomWalkNoise
+from cconv.training.examples import AugmentedExamples
+from cconv.training.unroll import Pushforward, pushed
+
+TASK, SCENE = task_named("acceleration"), periodic_scene()
+
+
+@pytest.fixture
+def samples(generator):
+    return WindowSamples([window_of(periodic_frame(generator), generator, future=4)], SCENE, TASK)
+
+
+@pytest.fixture
+def model(samples, generator):
+    return model_of(configured(layers=1), SCENE, "acceleration", list(samples), generator)
+
+
+def test_there_are_no_steps_before_it_begins_and_all_numbers_after(generator):
+    pushforward = Pushforward(most=3, begins=10)
+    assert {pushforward.steps(9, generator) for _ in range(20)} == {0}
+    assert {pushforward.steps(10, generator) for _ in range(60)} == {0, 1, 2, 3}
+
+
+def test_the_window_is_that_of_the_models_rollout_and_the_target_leads_back(samples, model):
+    start = samples.windows[0]
+    window = pushed(model, start, SCENE, 2)
+    path = rollout(model, start, SCENE)
+    next(path)
+    assert torch.equal(window.present, next(path).present)
+    assert not window.present.requires_grad
+    following = TASK.integrator.advance(window, TASK.target(window, SCENE), SCENE)
+    off = SCENE.box.displacement(following.present, start.future[2].double())
+    assert off.abs().max() < 1e-9
+
+
+def test_a_rollout_that_diverges_stays_where_it_came(samples):
+    class Broken:
+        task = TASK
+
+        def predict_frame(self, window, scene):
+            return torch.full((64, 2), torch.nan)
+
+    assert torch.equal(pushed(Broken(), samples.windows[0], SCENE, 3).present, samples.windows[0].present)
+
+
+def test_examples_are_never_pushed_beyond_what_is_stored(samples, model):
+    examples = AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(20, 0), seed=0)
+    frames = {examples.draw(0, update, model).frame for update in range(1, 40)}
+    assert frames == {5, 6, 7, 8}  # at least one frame of future is left to lead to
