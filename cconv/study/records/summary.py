@@ -21,6 +21,7 @@ class TaskFacts(StrictModel):
         error: Name of the error.
         error_meaning: Explanation of the error.
         measures: Explanation of each further measure, by its name.
+        mean_predictor: Explanation of the error of always predicting the mean.
     """
 
     name: Name
@@ -29,6 +30,7 @@ class TaskFacts(StrictModel):
     error: str
     error_meaning: str
     measures: dict[str, str]
+    mean_predictor: str = ""
 
 
 class DatasetFacts(StrictModel):

@@ -366,6 +366,7 @@ def _task(session: Session) -> TaskFacts:
         error=objective.label,
         error_meaning=objective.meaning,
         measures=objective.measures,
+        mean_predictor=objective.mean_predictor,
     )
 
 
