@@ -189,12 +189,12 @@ def _check_cutoff(cutoff: float, box: Box | None) -> None:
 
 def _sorted_in_cells(sets: Sequence[Tensor], cutoff: float, box: Box | None) -> tuple[CellGrid, list[Cells]]:
     """Cells of the cutoff around the first of `sets` of points, and each of them sorted by these cells."""
-    arrays = [_from_corner(points.detach().cpu().double(), box).numpy() for points in sets]
+    arrays = [from_corner(points.detach().cpu().double(), box).numpy() for points in sets]
     grid = CellGrid.around(arrays[0], cutoff, _periodic_lengths(sets[0].shape[1], box))
     return grid, [grid.sort(points) for points in arrays]
 
 
-def _from_corner(points: Tensor, box: Box | None) -> Tensor:
+def from_corner(points: Tensor, box: Box | None) -> Tensor:
     """Points brought back into the box along periodic axes and counted from its lower corner, or as they are."""
     if box is None or not any(box.periodic):
         return points.contiguous()
