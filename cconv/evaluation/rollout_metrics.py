@@ -1,4 +1,4 @@
-"""Errors of a rollout frame by frame: positions, kinetic energy and momentum."""
+"""Metrics of a rollout frame by frame: positions, kinetic energy, momentum and speeds."""
 
 import torch
 from torch import Tensor
@@ -61,6 +61,11 @@ def momentum_drift(positions: Tensor, masses: Tensor, box: Box) -> Tensor:
     weighted = masses.double()[:, None] * _displacements(positions, box)
     scale = weighted[0].norm(dim=1).sum().clamp(min=torch.finfo(torch.float64).tiny)
     return (weighted - weighted[0]).sum(dim=1).norm(dim=1) / scale
+
+
+def speeds(positions: Tensor, box: Box, frame_dt: float) -> Tensor:
+    """Speeds of the particles between each two of the frames (T, N, D), (T - 1, N), float64, length per time."""
+    return _displacements(positions, box).norm(dim=2) / frame_dt
 
 
 def _displacements(positions: Tensor, box: Box) -> Tensor:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cconv.domain import Box
-from cconv.evaluation.rollout_metrics import kinetic_energies, momentum_drift, mse_n, squared_errors
+from cconv.evaluation.rollout_metrics import kinetic_energies, momentum_drift, mse_n, speeds, squared_errors
 
 BOX = Box((0.0, 0.0), (1.0, 2.0), (True, False))
 
@@ -38,6 +38,7 @@ def test_kinetic_energy_of_a_uniform_flow_is_known():
     positions = BOX.wrap(torch.full((5, 40, 2), 0.5) + times * torch.tensor([0.3, 0.04]))
     energies = kinetic_energies(positions, BOX, particle_spacing=0.1, frame_dt=0.5)
     assert torch.allclose(energies, torch.full((4,), 0.1**2 * 40 * (0.6**2 + 0.08**2), dtype=torch.float64))
+    assert torch.allclose(speeds(positions, BOX, 0.5), torch.tensor(math.hypot(0.6, 0.08), dtype=torch.float64))
 
 
 def test_momentum_drifts_only_where_something_pushes(generator):
