@@ -80,7 +80,7 @@ def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, t
     facts = json.loads((tmp_path / "out" / "metrics.json").read_text())
     box = rolled.scene.box
     errors = box.displacement(found[3:].double(), reference[3:].double()).square().mean(dim=(1, 2))
-    assert facts["mse"] == pytest.approx(errors.tolist(), rel=1e-3, abs=1e-12)
+    assert facts["metrics"]["mse"] == pytest.approx(errors.tolist(), rel=1e-3, abs=1e-12)
     assert facts["mse_n"]["5"] == pytest.approx(float(errors[:5].mean()), rel=1e-3)
     assert facts["ended"] is None
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
@@ -95,7 +95,9 @@ def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
     facts = json.loads(printed)
     assert code == 0
     assert facts["frames"] == 13  # all that follow the first window
-    assert set(facts["e_kin"]) == {"rollout", "reference"}
+    metrics = facts["metrics"]
+    assert (metrics["frames"], metrics["sinkhorn_frames"]) == ([10], [10])
+    assert set(metrics["rollout"]) == set(metrics["reference"]) > {"e_kin", "momentum_drift", "rho_mae", "dirichlet"}
 
 
 @pytest.mark.parametrize(

@@ -141,10 +141,16 @@ def _print(facts: dict, out: Path | None) -> None:
     end = "" if facts["ended"] is None else f"; it {facts['ended']}"
     lines = [f"{facts['frames']} frames from frame {facts['first_frame'] + facts['history']} on{end}"]
     lines += [f"MSE_{n}: {value:.4g}" for n, value in facts["mse_n"].items()]
-    energies = facts["e_kin"]
-    ratio = energies["rollout"][-1] / energies["reference"][-1] if energies["reference"][-1] > 0 else math.inf
-    lines.append(f"Kinetic energy in the last frame, relative to the stored one: {ratio:.4g}")
-    lines.append(f"Momentum drift in the last frame: {facts['momentum_drift'][-1]:.4g} of the initial momenta")
+    metrics = facts["metrics"]
+    energy, stored = (metrics[path]["e_kin"][-1] for path in ("rollout", "reference"))
+    ratio = energy / stored if stored > 0 else math.inf
+    lines.append(f"At frame {metrics['frames'][-1]} of the rollout:")
+    lines.append(f"  kinetic energy ÷ that of the stored frame  {ratio:.4g}")
+    lines.append(f"  drift of the momentum ÷ initial momenta    {metrics['rollout']['momentum_drift'][-1]:.4g}")
+    densities = (f"{metrics[path]['rho_mae_unclamped'][-1]:.4g}" for path in ("rollout", "reference"))
+    lines.append(f"  mean |ρ - 1|, rollout and stored           {', '.join(densities)}")
+    lines.append(f"  Chamfer distance                           {metrics['chamfer'][-1]:.4g}")
+    lines.append(f"Sinkhorn divergence at frame {metrics['sinkhorn_frames'][-1]}: {metrics['sinkhorn'][-1]:.4g}")
     lines.append(f"{facts['milliseconds_per_frame']:.4g} ms per frame")
     if out is not None:
         lines.append(f"Written: {out}")

@@ -1,5 +1,6 @@
 """A rollout from a stored window, with its time per frame, kept as far as it came."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -13,12 +14,13 @@ from cconv.data.dataset import Dataset
 from cconv.data.hdf5 import write_dataset
 from cconv.data.trajectory import Scene, Trajectory, finite_difference_velocities
 from cconv.data.window import Window
-from cconv.evaluation.rollout_metrics import kinetic_energies, momentum_drift, squared_errors
+from cconv.evaluation.rollout_comparison import rollout_metrics
 from cconv.models.model import Model
 from cconv.rollout.rollout import Diverged, rollout
 
 DIFFERENCES = "central differences of positions"
 LENGTHS = (1, 5, 10, 20, 50, 100, 200, 400)  # frames n of MSE_n, as in LagrangeBench
+MOST_SINKHORN = 4  # frames: one takes seconds
 WARM_UP = 2  # frames at the start whose time does not count
 
 
@@ -74,27 +76,33 @@ def record_rollout(
     )
 
 
-def rollout_facts(recorded: RecordedRollout, scene: Scene) -> dict:
-    """Measures of a rollout of at least one frame, plain values by the names of LagrangeBench's metrics."""
-    errors = squared_errors(recorded.positions, recorded.reference, scene.box).numpy()
-    last = recorded.start.present[None].double()
-    paths = {
-        "rollout": torch.cat([last, recorded.positions.double()]),
-        "reference": torch.cat([last, recorded.reference.double()]),
-    }
-    energies = {
-        name: kinetic_energies(path, scene.box, scene.particle_spacing, scene.frame_dt).tolist()
-        for name, path in paths.items()
-    }
-    drift = momentum_drift(paths["rollout"], recorded.start.masses, scene.box)
+def rollout_facts(recorded: RecordedRollout, scene: Scene, stride: int = 10) -> dict:
+    """Measures of a rollout of at least one frame, by the names of LagrangeBench's and Neural SPH's metrics.
+
+    Args:
+        recorded: The rollout.
+        scene: Its scene.
+        stride: Frames from one that is looked at to the next, at most; squared errors are of every frame, and Sinkhorn
+            divergences of at most `MOST_SINKHORN`.
+    """
+    last, start = recorded.start.present[None].double(), recorded.start
+    count = len(recorded.positions)
+    stride = min(stride, count)
+    metrics = rollout_metrics(
+        torch.cat([last, recorded.positions.double()]),
+        torch.cat([last, recorded.reference.double()]),
+        start.masses,
+        start.is_fluid,
+        scene,
+        stride=stride,
+        sinkhorn_stride=math.ceil(count // stride / MOST_SINKHORN),
+    )
     return {
-        "frames": len(errors),
+        "frames": count,
         "ended": recorded.ended,
         "milliseconds_per_frame": recorded.milliseconds_per_frame,
-        "mse_n": {str(n): float(errors[:n].mean()) for n in sorted({*LENGTHS, len(errors)}) if n <= len(errors)},
-        "mse": errors.tolist(),
-        "e_kin": energies,
-        "momentum_drift": drift.tolist(),
+        "mse_n": {str(n): float(metrics.mse[:n].mean()) for n in sorted({*LENGTHS, count}) if n <= count},
+        "metrics": metrics.as_dict(),
     }
 
 

@@ -99,8 +99,9 @@ def rollout_metrics(
 ) -> RolloutMetrics:
     """All metrics of a rollout beside the stored frames, every few frames.
 
-    They are of the fluid alone, also where LagrangeBench and Neural SPH average over all particles: walls, whose
-    positions are prescribed, would dilute errors. In sums for densities and as neighbours all particles count.
+    The squared error is that of all particles, as in LagrangeBench. All others are of the fluid alone, also where
+    LagrangeBench and Neural SPH average over all particles, because walls, whose positions are prescribed, would dilute
+    them. In sums for densities and as neighbours all particles count.
 
     Args:
         positions: The frame that the rollout began with and the T that it predicted, (T + 1, N, D).
@@ -136,7 +137,7 @@ def rollout_metrics(
     transported = frames[::sinkhorn_stride]
     return RolloutMetrics(
         frames=frames,
-        mse=squared_errors(fluid[0], fluid[1], scene.box)[1:].numpy(),
+        mse=squared_errors(*both, scene.box)[1:].numpy(),
         e_kin_mse=np.square(found.e_kin - stored.e_kin),
         chamfer=np.array([chamfer_distance(*pair) for pair in pairs.values()]),
         sinkhorn_frames=transported,
