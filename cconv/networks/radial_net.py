@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import zip_longest
 from typing import Literal
 
 import torch
@@ -91,9 +90,9 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         dim: Number of space dimensions D.
         activation: "relu", "gelu", "tanh" or "leaky_relu", of scalars.
         message: Name in `cconv.nn.radial_conv.MESSAGES`, of all fluid convolutions.
-        conserves_momentum: Whether the last layer only adds what pairs of particles give to each other with opposite
-            signs, so that predicted vectors have the sum 0 over all particles. It has "opposite" messages and no
-            linear map then.
+        conserves_momentum: Whether predicted vectors have the sum 0 over all particles. The last layer then has
+            "opposite" messages, which pairs of particles give to each other with opposite signs, and its linear map
+            takes differences from the mean over the particles.
         residual: Whether outputs of layers of equal width are added up.
         generator: Source of the initial weights; None for torch's global one.
 
@@ -116,6 +115,7 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         super().__init__()
         check_choice("activation", activation, ACTIVATIONS)
         self.activation, self.residual, self.dim = activation, residual, dim
+        self.conserves_momentum = conserves_momentum
         *hidden, last = channels.layers
         self.hidden_channels, self.own_channels = hidden, channels.mapped
         inputs = [channels.inputs, *hidden]
@@ -127,11 +127,9 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
             conv_of(before, after, message=sent) for before, after, sent in zip(inputs, outputs, messages, strict=True)
         )
         has_bias = message != "difference" or last.vectors > 0  # a scalar of equal features is 0 by differences
-        mapped = list(zip([self.own_channels, *hidden], outputs, strict=True))
+        mapped = zip([self.own_channels, *hidden], outputs, strict=True)
         self.dense = Layers(
-            VectorLinear(before, after, dim, has_bias, generator)
-            for before, after in (mapped[:-1] if conserves_momentum else mapped)
-            if any(before)
+            VectorLinear(before, after, dim, has_bias, generator) for before, after in mapped if any(before)
         )
 
     @property
@@ -143,7 +141,12 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         """Select the inputs of that map from features (N, S + V · D)."""
         own = self.own_channels
         scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
-        return join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
+        selected = join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
+        return self._mapped_last(selected) if len(self.convs) == 1 else selected
+
+    def _mapped_last(self, values: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+        """Inputs of the linear map of the last layer, whose outputs add up to 0 if momentum is conserved."""
+        return values - values.mean(dim=0) if self.conserves_momentum else values
 
     def forward(
         self,
@@ -158,10 +161,10 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         for conv, seen in with_inputs(self.boundary_conv, walls):
             output = output + conv(seen.features, seen.geometry)
         following_dense = self.dense[any(self.own_channels) :]
-        for channels, conv, dense in zip_longest(self.hidden_channels, self.convs[1:], following_dense):
+        for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
-            following = conv.convolve(activated, geometry)
-            following = following if dense is None else following + dense(activated)
+            mapped = self._mapped_last(activated) if conv is self.convs[-1] else activated
+            following = conv.convolve(activated, geometry) + dense(mapped)
             output = following + output if self.residual and following.shape == output.shape else following
         return output
 
@@ -283,18 +286,14 @@ class RadialNetSettings(ConvolutionSettings):
         convs = [CountedConv(*kinds, fluid) for kinds in zip(before, after, strict=True)]
         if walls is not None:
             convs.append(CountedConv(walls, after[0], boundary))
-        maps = list(mapped)[: len(after) - self.conserves_momentum]
-        return convs, [kinds for kinds in maps if any(kinds[0])]
+        return convs, [kinds for kinds in mapped if any(kinds[0])]
 
     def own(self, inputs: Kinds, outputs: Kinds) -> Kinds:
         """Return the inputs of the first layer's linear map; see `ConvolutionSettings.own`.
 
         Where scalars are sent as they are and vectors as differences, the last vector, a velocity, is left out: the
-        network then does not see at which velocity the whole scene moves. A single layer that conserves momentum has
-        no such map.
+        network then does not see at which velocity the whole scene moves.
         """
-        if self.conserves_momentum and self.layers == 1:
-            return Kinds(0, 0)
         own = super().own(inputs, outputs)
         return own if self.message in ("absolute", "difference") else Kinds(own.scalars, max(0, own.vectors - 1))
 
