@@ -110,6 +110,11 @@ class SimulatedScene(ABC):
         """Positions and velocities of the fluid at the start, both (N, D), float64."""
 
     @property
+    def corner(self) -> tuple[float, ...]:
+        """Lower corner of the space for fluid, which stays where it is in the flow if the particle spacing changes."""
+        return self.box.lower
+
+    @property
     def walls(self) -> Walls:
         """Wall particles; none by default."""
         return Walls.none(self.dim)
