@@ -10,7 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import ParticleType
 from cconv.errors import SimulationError
 from cconv.scenes.simulated_scene import SimulatedScene
-from cconv.sph.solver import ParticleState
+from cconv.sph.solver import ParticleState, WeaklyCompressibleSPH
 
 ATTEMPTS = 5  # LagrangeBench lost 15 of 115 dam breaks
 
@@ -75,9 +75,7 @@ def _run(
             positions[frame] = scene.box.wrap(state.positions[stored].float())
             velocities[frame] = state.velocities[stored].float()
         if frame < num_frames - 1:
-            for _ in range(scene.steps_per_frame):
-                state = solver.step(state, scene.time_step)
-            _check_speed(state, scene)
+            state = next_frame(scene, solver, state)
         yield
     moving = walls.velocities.any(dim=1)[walls.stored]
     types = torch.full((len(stored[stored]),), int(ParticleType.FLUID))
@@ -90,6 +88,18 @@ def _run(
         viscosity=float(state.viscosities[0]),
         failures=failures,
     )
+
+
+def next_frame(scene: SimulatedScene, solver: WeaklyCompressibleSPH, state: ParticleState) -> ParticleState:
+    """State a stored frame later.
+
+    Raises:
+        SimulationError: If the simulation blew up.
+    """
+    for _ in range(scene.steps_per_frame):
+        state = solver.step(state, scene.time_step)
+    _check_speed(state, scene)
+    return state
 
 
 def _check_speed(state: ParticleState, scene: SimulatedScene) -> None:

@@ -67,9 +67,14 @@ class Cuboid3D(SimulatedScene):
         return Box((-self.wall_thickness,) * 3, (self.side + self.wall_thickness,) * 3)
 
     @property
+    def corner(self) -> tuple[float, ...]:
+        """The origin."""
+        return (0.0,) * 3
+
+    @property
     def walls(self) -> Walls:
         """All six sides, none of them stored."""
-        walls = walls_around(self._counts, self.particle_spacing, (0.0,) * 3)
+        walls = walls_around(self._counts, self.particle_spacing, self.corner)
         return Walls(positions=walls.positions, velocities=walls.velocities, stored=torch.zeros_like(walls.stored))
 
     @property

@@ -58,7 +58,8 @@ class DamBreak2D(SimulatedScene):
         return [round(length / self.particle_spacing) for length in lengths]
 
     @property
-    def _corner(self) -> tuple[float, float]:
+    def corner(self) -> tuple[float, ...]:
+        """Of the space within the walls."""
         return (self.wall_thickness, self.wall_thickness)
 
     @property
@@ -69,11 +70,11 @@ class DamBreak2D(SimulatedScene):
     @property
     def walls(self) -> Walls:
         """The tank, lid included."""
-        return walls_around(self._counts(self.tank), self.particle_spacing, self._corner)
+        return walls_around(self._counts(self.tank), self.particle_spacing, self.corner)
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A lattice relaxed in a closed box of the column's size, at rest."""
         counts = self._counts(self.column)
-        closed = walls_around(counts, self.particle_spacing, self._corner)
-        positions = self.relaxed_lattice(counts, self._corner, closed, generator)
+        closed = walls_around(counts, self.particle_spacing, self.corner)
+        positions = self.relaxed_lattice(counts, self.corner, closed, generator)
         return positions, torch.zeros_like(positions)

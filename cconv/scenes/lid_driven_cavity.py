@@ -30,7 +30,8 @@ class _LidDrivenCavity(SimulatedScene):
     depth: ClassVar[tuple[float, ...]] = ()
 
     @property
-    def _corner(self) -> tuple[float, ...]:
+    def corner(self) -> tuple[float, ...]:
+        """Of the space within the walls."""
         return (self.wall_thickness, self.wall_thickness, *(0.0 for _ in self.depth))
 
     @property
@@ -56,12 +57,12 @@ class _LidDrivenCavity(SimulatedScene):
     @property
     def _walls_at_rest(self) -> Walls:
         return walls_around(
-            self._counts, self.particle_spacing, self._corner, [True, True, *(False for _ in self.depth)]
+            self._counts, self.particle_spacing, self.corner, [True, True, *(False for _ in self.depth)]
         )
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice at rest."""
-        positions = self.relaxed_lattice(self._counts, self._corner, self._walls_at_rest, generator)
+        positions = self.relaxed_lattice(self._counts, self.corner, self._walls_at_rest, generator)
         return positions, torch.zeros_like(positions)
 
 

@@ -110,6 +110,11 @@ class SimulatedScene(ABC):
         """Positions and velocities of the fluid at the start, both (N, D), float64."""
 
     @property
+    def corner(self) -> tuple[float, ...]:
+        """Lower corner of the space for fluid, which stays where it is in the flow if the particle spacing changes."""
+        return self.box.lower
+
+    @property
     def walls(self) -> Walls:
         """Wall particles; none by default."""
         return Walls.none(self.dim)
@@ -181,16 +186,30 @@ class SimulatedScene(ABC):
 
     def initial_state(self, generator: torch.Generator) -> ParticleState:
         """Walls first, then fluid."""
-        walls = self.walls
         positions, velocities = self.fluid(generator)
+        return self.state_of(self.walls, positions, velocities, self.draw_viscosity(generator))
+
+    def state_of(
+        self, walls: Walls, positions: Tensor, velocities: Tensor, viscosity: float, amid_flow: bool = False
+    ) -> ParticleState:
+        """State of walls and fluid particles, walls first.
+
+        Args:
+            walls: Wall particles.
+            positions: Of the fluid (N, D).
+            velocities: Of the fluid (N, D).
+            viscosity: Kinematic viscosity ν of all particles.
+            amid_flow: Whether the flow has a past, see `WeaklyCompressibleSPH.initial_state`.
+        """
         particles = len(walls) + len(positions)
         mass = self.rest_density * self.particle_spacing**self.dim
         return self.solver().initial_state(
             torch.cat([walls.positions, positions]),
             torch.cat([walls.velocities, velocities]),
             masses=torch.full((particles,), mass, dtype=torch.float64),
-            viscosities=torch.full((particles,), self.draw_viscosity(generator), dtype=torch.float64),
+            viscosities=torch.full((particles,), viscosity, dtype=torch.float64),
             is_wall=torch.arange(particles) < len(walls),
+            amid_flow=amid_flow,
         )
 
     @property

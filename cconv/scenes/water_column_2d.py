@@ -38,7 +38,8 @@ class WaterColumn2D(SimulatedScene):
     }
 
     @property
-    def _corner(self) -> tuple[float, float]:
+    def corner(self) -> tuple[float, ...]:
+        """Of the space within the walls."""
         return (self.wall_thickness, self.wall_thickness)
 
     @property
@@ -56,10 +57,10 @@ class WaterColumn2D(SimulatedScene):
     def walls(self) -> Walls:
         """Bottom, sides and lid of the box."""
         across, up = self._counts
-        return walls_around((across, up + up // 2), self.particle_spacing, self._corner)
+        return walls_around((across, up + up // 2), self.particle_spacing, self.corner)
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A lattice relaxed in a closed box of the water's size, at rest."""
-        closed = walls_around(self._counts, self.particle_spacing, self._corner)
-        positions = self.relaxed_lattice(self._counts, self._corner, closed, generator)
+        closed = walls_around(self._counts, self.particle_spacing, self.corner)
+        positions = self.relaxed_lattice(self._counts, self.corner, closed, generator)
         return positions, torch.zeros_like(positions)

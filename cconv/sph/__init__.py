@@ -10,7 +10,7 @@ from cconv.sph.kernels import (
     WendlandC4,
     kernel_named,
 )
-from cconv.sph.operators import density, density_gradient, density_rate
+from cconv.sph.operators import density, density_gradient, density_rate, interpolate
 from cconv.sph.solver import EquationOfState, ParticleState, Scheme, WeaklyCompressibleSPH
 
 __all__ = [
@@ -28,5 +28,6 @@ __all__ = [
     "density",
     "density_gradient",
     "density_rate",
+    "interpolate",
     "kernel_named",
 ]

@@ -1,4 +1,4 @@
-r"""SPH sums over neighbours: density D1, its rate D2, its gradient D3.
+r"""SPH sums over neighbours: density D1, its rate D2, its gradient D3, and interpolation.
 
 Numbers are those of the thesis, section 2.2.1; i is ``edges.receivers``, j is ``edges.senders``, and
 :math:`\nabla_i W_{ij} = W'(r_{ij})\, r_{ij} / |r_{ij}|` with :math:`r_{ij} = x_i - x_j` = ``edges.displacements``.
@@ -98,6 +98,34 @@ def density_gradient(
     return _sum_over_neighbours(terms, edges) / densities[:, None]
 
 
+def interpolate(
+    values: Float[Tensor, "M C"], volumes: Float[Tensor, " M"], edges: Edges, kernel: AbstractKernel
+) -> Float[Tensor, "N C"]:
+    r"""Interpolate values of particles, normalised by Shepard so that constants are reproduced.
+
+    .. math:: A(x_i) = \sum_j V_j A_j W_{ij} \Big/ \sum_j V_j W_{ij}
+
+    Linear fields are off by a part of the particle spacing times their slope. A receiver without a neighbour gets NaN.
+
+    Args:
+        values: A of the senders (M, C).
+        volumes: V = m/ρ of the senders (M,).
+        edges: Pairs within at least the kernel's support; usually bipartite.
+        kernel: W.
+
+    Raises:
+        ShapeError: If shapes do not fit the edges.
+        ConfigError: If the edges do not reach as far as the kernel, or differ from it in dimension.
+    """
+    senders = edges.num_senders
+    check_sum(edges, kernel, volumes=(volumes, (senders,)), values=(values, (senders, "components")))
+    weights = volumes[edges.senders] * kernel.value(edges.distances)
+    return (
+        _sum_over_neighbours(weights[:, None] * values[edges.senders], edges)
+        / _sum_over_neighbours(weights, edges)[:, None]
+    )
+
+
 def kernel_gradient(edges: Edges, kernel: AbstractKernel) -> Float[Tensor, "E D"]:
     """∇_i W_ij of every edge (E, D); zero where two particles coincide."""
     apart = edges.distances > 0
@@ -109,7 +137,7 @@ def _sum_over_neighbours(terms: Tensor, edges: Edges) -> Tensor:
     return terms.new_zeros(edges.num_receivers, *terms.shape[1:]).index_add(0, edges.receivers, terms)
 
 
-def check_sum(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[int, ...]]) -> None:
+def check_sum(edges: Edges, kernel: AbstractKernel, **tensors: tuple[Tensor, tuple[int | str, ...]]) -> None:
     """Raise `ShapeError` or `ConfigError` unless a sum with the kernel can be taken over the edges.
 
     Args:

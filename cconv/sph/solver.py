@@ -208,9 +208,18 @@ class WeaklyCompressibleSPH:
         self._neighbors = NeighborList(box, kernel.support_radius, skin * particle_spacing)
 
     def initial_state(
-        self, positions: Tensor, velocities: Tensor, masses: Tensor, viscosities: Tensor, is_wall: Tensor
+        self,
+        positions: Tensor,
+        velocities: Tensor,
+        masses: Tensor,
+        viscosities: Tensor,
+        is_wall: Tensor,
+        amid_flow: bool = False,
     ) -> ParticleState:
         """State at the start: summed densities, or the rest density where densities are evolved.
+
+        Amid a flow evolved densities begin as summed ones, but at least the rest density, because sums lack what is
+        beyond a free surface.
 
         Args:
             positions: x (N, D).
@@ -218,10 +227,11 @@ class WeaklyCompressibleSPH:
             masses: m (N,).
             viscosities: ν (N,).
             is_wall: Which particles are walls (N,), bool.
+            amid_flow: Whether the flow has a past, in which particles may have come to nearly the same place.
 
         Raises:
             ShapeError: If shapes or dtypes do not fit.
-            ConfigError: If a particle lies outside the box, or two fluid particles overlap.
+            ConfigError: If a particle lies outside the box, or two fluid particles overlap at the start of a flow.
         """
         particles = len(positions)
         check_shape("positions", positions.shape, (particles, self.box.dim))
@@ -235,7 +245,8 @@ class WeaklyCompressibleSPH:
         )
         positions = self.box.wrap(positions)
         _check_inside(positions, self.box)
-        _check_apart(positions, self.box, self.particle_spacing)
+        if not amid_flow:
+            _check_apart(positions, self.box, self.particle_spacing)
         state = ParticleState(
             positions=positions,
             velocities=velocities,
@@ -245,9 +256,12 @@ class WeaklyCompressibleSPH:
             viscosities=viscosities,
             is_wall=is_wall.clone(),
         )
-        if self._scheme.density == "evolution":
+        evolved = self._scheme.density == "evolution"
+        if evolved and not amid_flow:
             return state
-        return replace(state, densities=torch.from_numpy(self._summed(_Arrays(state))))
+        densities = torch.from_numpy(self._summed(_Arrays(state)))
+        least = self.equation_of_state.rest_density if evolved else 0.0
+        return replace(state, densities=densities.clamp(min=least))
 
     def step(self, state: ParticleState, time_step: float) -> ParticleState:
         """State one semi-implicit Euler step later: velocities first, then positions, then densities.

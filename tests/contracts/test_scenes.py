@@ -16,6 +16,7 @@ from cconv.domain import Box
 from cconv.evaluation.rollout_metrics import squared_errors
 from cconv.rollout.rollout import advance
 from cconv.scenes import SCENES, scene_named
+from cconv.scenes.find import find_scene
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.integrators import SemiImplicitEuler
@@ -119,6 +120,14 @@ def test_a_scene_becomes_a_data_set_that_says_what_it_is(scene, dataset):
     assert (trajectory.viscosities is not None) == scene.features["varying_viscosity"]
     assert torch.isfinite(trajectory.velocities).all()
     assert are_inside(trajectory.positions[:, trajectory.particle_types == 0], scene.box)
+
+
+@pytest.mark.integration
+def test_the_scene_of_a_data_set_is_found(scene, dataset):
+    found, reason = find_scene(dataset.metadata)
+    assert reason == ""
+    not_stored = ("num_frames", "skipped_frames", "num_trajectories", "relaxation_steps")
+    assert replace(found, **{name: getattr(scene, name) for name in not_stored}) == scene
 
 
 @pytest.mark.integration

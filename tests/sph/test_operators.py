@@ -7,7 +7,16 @@ from oracles.brute_force_neighbors import brute_force_pairs
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
-from cconv.sph import KERNELS, CubicSpline, WendlandC2, density, density_gradient, density_rate, kernel_named
+from cconv.sph import (
+    KERNELS,
+    CubicSpline,
+    WendlandC2,
+    density,
+    density_gradient,
+    density_rate,
+    interpolate,
+    kernel_named,
+)
 
 SUPPORT = 0.45
 DEFORMATION = torch.tensor([[1.0, 2.0, -0.5], [0.3, -2.5, 0.7], [0.1, 0.4, 3.5]], dtype=torch.float64)
@@ -468,3 +477,30 @@ def test_rate_and_gradient_need_edges_within_one_set():
     for operator in operators:
         with pytest.raises(ConfigError, match="`edges` must join the particles of one set"):
             operator()
+
+
+@over_all_kernels
+@over_dims
+def test_interpolation_reproduces_constants_and_weighs_by_volume_and_kernel(name, dim, generator):
+    kernel, (positions, velocities, volumes) = make(name, dim), random_fluid(dim, generator)
+    points = torch.rand(7, dim, dtype=torch.float64, generator=generator)
+    edges = radius_graph(positions, kernel.support_radius, queries=points)
+    alone = edges.row_splits.diff() == 0
+    constant = interpolate(torch.full((25, 1), 3.7, dtype=torch.float64), volumes, edges, kernel)
+    torch.testing.assert_close(constant[~alone], torch.full_like(constant[~alone], 3.7))
+    weights = (
+        volumes
+        * kernel.value(torch.cdist(points, positions))
+        * (torch.cdist(points, positions) <= kernel.support_radius)
+    )
+    expected = weights @ velocities / weights.sum(dim=1, keepdim=True)
+    found = interpolate(velocities, volumes, edges, kernel)
+    torch.testing.assert_close(found, expected, equal_nan=True)
+    assert found.isnan().all(dim=1).equal(alone)
+
+
+def test_interpolation_refuses_values_of_other_particles(generator):
+    kernel, (positions, velocities, volumes) = make("cubic_spline", 2), random_fluid(2, generator)
+    edges = radius_graph(positions, kernel.support_radius)
+    with pytest.raises(ShapeError, match="`values` must have shape"):
+        interpolate(velocities[1:], volumes, edges, kernel)
