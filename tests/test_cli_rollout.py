@@ -72,6 +72,7 @@ def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, t
     assert code == 0
     assert "MSE_5: " in printed
     assert "ms per frame" in printed
+    assert "The solver's 10 steps to the next frame take" in printed
     stored = open_dataset(steps_folder).trajectory("test", 0).positions[2:12]
     rolled = open_dataset(tmp_path / "out")
     found, reference = (rolled.trajectory(split, 0).positions for split in ("test", "valid"))
@@ -83,6 +84,7 @@ def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, t
     assert facts["metrics"]["mse"] == pytest.approx(errors.tolist(), rel=1e-3, abs=1e-12)
     assert facts["mse_n"]["5"] == pytest.approx(float(errors[:5].mean()), rel=1e-3)
     assert facts["ended"] is None
+    assert facts["solver"]["milliseconds_per_frame"] > 0
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "train.h5", "valid.h5", "test.h5", "metadata.json", "metrics.json", "rollout.gif", "vtk"
     }  # fmt: skip

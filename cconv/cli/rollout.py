@@ -9,13 +9,14 @@ import typer
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, parse_vector
 from cconv.cli.study import DataPath
-from cconv.errors import ConfigError
+from cconv.errors import CConvError, ConfigError
 
 if TYPE_CHECKING:
     from cconv.data.dataset import Dataset
     from cconv.evaluation.recorded_rollout import RecordedRollout
 
 METRICS, ANIMATION = "metrics.json", "rollout.gif"
+SOLVER_REPEATS = 3
 LONGEST_ANIMATION = 60  # frames; longer rollouts are drawn every few frames
 
 
@@ -86,6 +87,7 @@ def rollout(
         raise ConfigError(f"{checkpoint}: no frame was predicted ({recorded.ended}); there is nothing to compare.")
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
+    facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:
         _write(out, recorded, dataset, facts, vtk)
     if as_json:
@@ -103,6 +105,23 @@ def _recommended(path: Path) -> Path:
     if not (path / "summary.json").is_file():
         return path
     return path / RunFolder.open(path).summary().chosen.checkpoint
+
+
+def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
+    """Time the solver for the frame after the start, if the data say what they were made with; else say why not."""
+    import torch
+
+    from cconv.evaluation.solver_cost import measure_solver
+    from cconv.scenes.find import find_scene
+
+    scene, reason = find_scene({"dim": dataset.scene.dim, **dataset.metadata})
+    if scene is None:
+        return {"not_timed": reason}
+    try:
+        cost = measure_solver(scene, recorded.start, threads=torch.get_num_threads(), repeats=SOLVER_REPEATS)
+    except CConvError as error:
+        return {"not_timed": str(error)}
+    return {"milliseconds_per_frame": cost.ms_per_frame, "low": cost.ms_low, "high": cost.ms_high, "steps": cost.steps}
 
 
 def _warn_of_spacing(found: float, trained: float) -> None:
@@ -151,7 +170,14 @@ def _print(facts: dict, out: Path | None) -> None:
     lines.append(f"  mean |ρ - 1|, rollout and stored           {', '.join(densities)}")
     lines.append(f"  Chamfer distance                           {metrics['chamfer'][-1]:.4g}")
     lines.append(f"Sinkhorn divergence at frame {metrics['sinkhorn_frames'][-1]}: {metrics['sinkhorn'][-1]:.4g}")
-    lines.append(f"{facts['milliseconds_per_frame']:.4g} ms per frame")
+    own, solver = facts["milliseconds_per_frame"], facts["solver"]
+    lines.append(f"{own:.4g} ms per frame")
+    if "not_timed" in solver:
+        lines.append(f"The solver was not timed: {solver['not_timed']}")
+    else:
+        theirs = solver["milliseconds_per_frame"]
+        steps = f"The solver's {solver['steps']} steps to the next frame take {theirs:.4g} ms"
+        lines.append(f"{steps}, {theirs / own:.3g} times as long")
     if out is not None:
         lines.append(f"Written: {out}")
     for line in lines:
