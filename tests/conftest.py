@@ -73,16 +73,23 @@ def solver_benchmark(benchmark_script):
     return benchmark_script("solver")
 
 
+def run_main(*arguments):
+    """Run `cconv` with arguments in this process; gives its exit status."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["cconv", *map(str, arguments)])
+        with pytest.raises(SystemExit) as caught:
+            main()
+    return caught.value.code or 0
+
+
 @pytest.fixture
-def cconv(monkeypatch, capfd):
+def cconv(capfd):
     """Run `cconv` with arguments in this process; gives (exit status, stdout, stderr)."""
 
     def run(*arguments):
-        monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
-        with pytest.raises(SystemExit) as caught:
-            main()
+        code = run_main(*arguments)
         printed = capfd.readouterr()
-        return caught.value.code or 0, printed.out, printed.err
+        return code, printed.out, printed.err
 
     return run
 

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from conftest import run_main
 
-from cconv.cli import main
 from cconv.data.dataset import open_dataset
 
 STUDY = """
@@ -36,21 +36,12 @@ grace_updates = 3
 """
 
 
-def run_main(monkeypatch, *arguments):
-    monkeypatch.setattr("sys.argv", ["cconv", *map(str, arguments)])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return caught.value.code or 0
-
-
 @pytest.fixture(scope="module")
 def fitted(steps_folder, tmp_path_factory):
     """Checkpoint of a closed form for steps."""
     place = tmp_path_factory.mktemp("fitted")
     (place / "study.toml").write_text(STUDY.format(layers=1))
-    with pytest.MonkeyPatch.context() as patch:
-        code = run_main(patch, "fit", place / "study.toml", "--data", steps_folder, "--out", place / "model")
-    assert code == 0
+    assert run_main("fit", place / "study.toml", "--data", steps_folder, "--out", place / "model") == 0
     return place / "model"
 
 

@@ -1,0 +1,49 @@
+"""A whole study of steps, from the closed form to the report: what is compared are rollouts."""
+
+import json
+
+import pytest
+from conftest import SMOKE, run_main
+
+from cconv.study.records.run_folder import RunFolder
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(scope="module")
+def run(steps_folder, tmp_path_factory):
+    folder, study = tmp_path_factory.mktemp("steps_study") / "run", SMOKE.with_name("smoke_steps.toml")
+    assert run_main("study", "run", study, "--serial", "--data", steps_folder, "--out", folder) == 0
+    return RunFolder.open(folder)
+
+
+def test_models_are_compared_by_rollouts_and_no_analytic_field(run):
+    summary = run.summary()
+    assert (summary.task.name, summary.task.error) == ("acceleration", "rollout MSE")
+    assert summary.analytic is None
+    assert summary.explained == ()
+    assert set(summary.checks) == {"completion", "motion", "packing"}
+    for entry in summary.finalists:
+        assert set(entry.test.measures) == {"first-frame MSE", "diverged rollouts"}
+        assert 0 < entry.test.error < 0.25
+        assert entry.stability.counts.plain_frames == 1
+
+
+def test_a_scene_without_walls_and_force_has_no_input_for_them(run):
+    for entry in run.summary().finalists:
+        config = json.loads((run.path / entry.checkpoint / "config.json").read_text())
+        assert not {"force", "particle_type"} & set(config["features"])
+        assert config["history"] == 3
+
+
+def test_the_report_speaks_of_rollouts(run):
+    page = (run.path / "report.html").read_text()
+    assert "rollouts from the validation split" in page
+    assert "squared lengths of the data" in page
+    assert "analytic SPH" not in page
+
+
+def test_the_recommended_model_of_the_run_is_rolled_out(run, cconv, tmp_path):
+    code, printed, _ = cconv("rollout", run.path, "--frames", 6, "--json")
+    assert code in (0, 1)  # a model of six updates may diverge
+    assert json.loads(printed)["checkpoint"].endswith("checkpoint")
