@@ -41,7 +41,7 @@ from cconv.study.running.private_ray import (  # noqa: E402
     token_of_this_run,
 )
 from cconv.study.running.problem import Problem  # noqa: E402
-from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, train_recorded  # noqa: E402
+from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, record_what_failed, train_recorded  # noqa: E402
 from cconv.study.running.trial_queue import Job, TrialQueue  # noqa: E402
 
 if TYPE_CHECKING:  # inner names of Ray, which a release may move
@@ -152,7 +152,7 @@ class RayPool:
         def trainable(config: dict) -> None:
             _train_and_report(config["job"], stage, training, *ray.get(shared))
 
-        driver = _Driver(queue)
+        driver = _Driver(queue, stage)
         tuner = tune.Tuner(
             tune.with_resources(trainable, {"cpu": 1}),
             tune_config=tune.TuneConfig(
@@ -198,8 +198,8 @@ class _Driver(_NeverRestored, tune.Callback):
     Ray keeps only the text of such an error, and may report further trials while it stops.
     """
 
-    def __init__(self, queue: TrialQueue):
-        self._queue = queue
+    def __init__(self, queue: TrialQueue, stage: str):
+        self._queue, self._stage = queue, stage
         self.error: Exception | None = None
 
     @contextmanager
@@ -233,6 +233,7 @@ class _Driver(_NeverRestored, tune.Callback):
     def on_trial_error(self, iteration: int, trials: list["RayTrial"], trial: "RayTrial", **info: object) -> None:
         """Record that the process or node of a training died too often."""
         with self._ends_the_run() as queue:
+            record_what_failed(trial.config["job"], self._stage)
             queue.on_end(str(trial), "failed", f"its process or node died {RESTARTS + 1} times")
 
 

@@ -50,7 +50,8 @@ def train_recorded(
     except Exception as error:
         outcome, reason = DISK_FULL if is_disk_full(error) else "failed", str(error) or type(error).__name__
     if outcome is not None:
-        _record_what_failed(job, stage, outcome)
+        if outcome == "failed":
+            record_what_failed(job, stage)
         yield Report(last, outcome, reason)
 
 
@@ -90,8 +91,9 @@ def _trial(
     )
 
 
-def _record_what_failed(job: Job, stage: str, outcome: str) -> None:
+def record_what_failed(job: Job, stage: str) -> None:
+    """Write the configuration of a job that failed, if it failed before it wrote it, so that its record can be read."""
     folder = TrialFolder(job.folder)
-    if outcome == "failed" and not folder.started:  # it failed before its configuration was written
+    if not folder.started:
         known = {"stage": stage, "parameters": job.parameters, "init_seed": job.init_seed}
         folder.start(known | {"num_parameters": None, "flops_per_particle": None})

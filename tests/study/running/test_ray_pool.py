@@ -4,16 +4,18 @@ import signal
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 import ray
 import troubles
 from processes import PATIENCE
-from troubles import BrokenJudge, study_of, trained_in, troubled_problem
+from troubles import BrokenJudge, jobs_in, study_of, trained_in, troubled_problem
 
 from cconv.errors import ConfigError
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.ray_pool import STARTS, RayPool, _start, ray_pool
+from cconv.study.running.ray_pool import STARTS, RayPool, _Driver, _start, ray_pool
+from cconv.study.running.trial_queue import TrialQueue
 
 pytestmark = pytest.mark.integration
 
@@ -122,3 +124,25 @@ def test_a_cluster_that_is_not_there_is_one_line(address, cores, tmp_path):
     with missing as caught, ray_pool(None, None, tmp_path, address):
         pass
     assert "\n" not in str(caught.value)
+
+
+class NamedTrial(NamedTuple):
+    """A trial of Ray as its callbacks see it."""
+
+    name: str
+    config: dict
+
+    def __str__(self):
+        return self.name
+
+
+def test_one_whose_process_died_before_it_wrote_its_configuration_has_a_record(tmp_path):
+    """As on a machine so busy that a process is ended at its limit before it has begun."""
+    (job,) = jobs_in(tmp_path, [7])
+    queue = TrialQueue([job], 2, None, [])
+    assert queue.next() is job
+    _Driver(queue, "random").on_trial_error(0, [], NamedTrial(job.name, {"job": job}))
+    record = TrialFolder(job.folder).read()
+    assert (record.stage, record.outcome) == ("random", "failed")
+    assert record.reason.startswith("its process or node died")
+    assert record.config["num_parameters"] is None
