@@ -157,8 +157,11 @@ def add_own(
     scalar_width, vector_width = uintp(scalar_columns.shape[3]), uintp(vector_columns.shape[3])
     edges, lower = np.empty(EDGES_AT_A_TIME, np.int64), np.empty(EDGES_AT_A_TIME, np.int32)
     shares, directions = np.empty((2, len(edges)), values.dtype), np.empty((dim, len(edges)), values.dtype)
-    order = np.empty(0, np.int32)
-    sums = np.empty((num_terms, 1 + dim, 1 + dim), values.dtype)  # of weights, directions, products of directions
+    order, zero, moment_width = np.empty(0, np.int32), uintp(0), (uintp(1) + dim) * (uintp(1) + dim)
+    moment_step = moment_width if num_terms > 1 else zero
+    moments = np.ones(moment_width, values.dtype)  # 1, direction; each component of it, its products with all
+    sums = np.empty((num_terms, uintp(1) + dim, uintp(1) + dim), values.dtype)
+    flat_sums = sums.reshape(-1)
     for row in range(uintp(first), uintp(last)):
         sums[:] = 0
         for start in range(splits[row], splits[row + uintp(1)], EDGES_AT_A_TIME):
@@ -168,8 +171,15 @@ def add_own(
                 edges, lower, shares, directions,
             )  # fmt: skip
             for k in range(count):
-                _add_moments(shares[0, k], directions, k, sums, uintp(lower[k]))
-                _add_moments(shares[1, k], directions, k, sums, min(uintp(lower[k]) + uintp(1), num_terms - uintp(1)))
+                for axis in range(dim):
+                    along = directions[axis, k]
+                    moments[uintp(1) + axis] = along
+                    here = (uintp(1) + axis) * (uintp(1) + dim)
+                    moments[here] = along
+                    for other in range(dim):
+                        moments[here + uintp(1) + other] = along * directions[other, k]
+                here = uintp(lower[k]) * moment_width
+                _add_to_terms(shares[0, k], shares[1, k], moments, zero, moment_width, flat_sums, here, moment_step)
         scalars, place = row * num_values, row - uintp(first)
         vectors = scalars + uintp(num_scalars)
         for term in range(num_terms):
@@ -192,14 +202,3 @@ def add_own(
                     here += uintp(num_scalars)
                     component = vectors + axis * num_vectors
                     _add(own_vectors * sums[term, 0, 0], mine, component, num_vectors, to_vectors, here)
-
-
-@njit(inline="always")
-def _add_moments(weight, directions, edge, sums, term):
-    """Add the weight of an edge, times its direction, times products of its components."""
-    sums[term, 0, 0] += weight
-    for axis in range(len(directions)):
-        along = weight * directions[axis, edge]
-        sums[term, 0, 1 + axis] += along
-        for other in range(len(directions)):
-            sums[term, 1 + axis, 1 + other] += along * directions[other, edge]
