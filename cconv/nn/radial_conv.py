@@ -21,7 +21,7 @@ all particles is 0.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float
@@ -37,9 +37,10 @@ from cconv.nn.continuous_conv import (
 )
 from cconv.nn.filters import WINDOWS, interpolate
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
-from cconv.ops import radial
+from cconv.ops import radial, radial_columns
 from cconv.ops.convolution import convolve
 from cconv.ops.filter_reads import FilterReads
+from cconv.ops.radial_columns import WeightedEdges
 
 MESSAGES = {"absolute": (0, 0), "difference": (-1, -1), "sum": (1, 1), "mixed": (0, -1), "opposite": (1, -1)}
 
@@ -97,9 +98,11 @@ class RadialGeometry:
 
     @property
     def nbytes(self) -> int:
-        """Memory in bytes, also of what convolutions add on first use."""
-        held = (self.senders, self.edges.displacements, self.edges.distances, self.directions)
-        return self.reads.nbytes + sum(tensor.nbytes for tensor in held)
+        """Largest memory in bytes: with all that convolutions could add on first use, of which most need little."""
+        edges = self.edges
+        values = 2 * edges.displacements.nbytes + 3 * edges.distances.nbytes  # also directions; fractions, weights
+        indices = 4 * 8 + 3 * 4  # of an edge: both points, itself, its place; its cell, two orders by sender
+        return values + indices * len(edges) + 8 * (edges.num_receivers + edges.num_senders + 3)
 
     @cached_property
     def directions(self) -> Float[Tensor, "E {self.dim}"]:
@@ -115,6 +118,11 @@ class RadialGeometry:
             return None
         with self._gradients():
             return importance(self.edges, self._window, self._normalize)
+
+    @cached_property
+    def weighted_edges(self) -> WeightedEdges:
+        """Edges and their weights for compiled loops in both directions."""
+        return WeightedEdges(edges=self.edges, weights=self.weights)
 
     @cached_property
     def reads(self) -> FilterReads:
@@ -210,21 +218,28 @@ class RadialConv(nn.Module):
     def convolve(self, features: Float[Tensor, "M C_in"], geometry: RadialGeometry) -> Float[Tensor, "N C_out"]:
         """`forward` without its checks, for hidden layers."""
         filters = self.scalar_filters, self.vector_filters
+        own = MESSAGES[self.message]
+        differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (features, *filters))
         if radial.applies(features, *filters, geometry.edges):
-            output = radial.convolve(features, *filters, geometry.edges, geometry.weights, MESSAGES[self.message])
+            output = radial.convolve(features, *filters, geometry.edges, geometry.weights, own)
+        elif differentiated and radial_columns.applies(features, geometry.weighted_edges):
+            general = partial(self._convolve_generally, geometry=geometry)
+            output = radial_columns.convolve(features, *filters, geometry.weighted_edges, own, general)
         else:
-            output = self._convolve_generally(features, geometry)
+            output = self._convolve_generally(features, *filters, geometry)
         if self.bias is None:
             return output
         return torch.cat([output[:, : len(self.bias)] + self.bias, output[:, len(self.bias) :]], dim=1)
 
-    def _convolve_generally(self, features: Tensor, geometry: RadialGeometry) -> Tensor:
-        """Any device and dtype, differentiable: convolutions of what each edge sends."""
+    def _convolve_generally(
+        self, features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, geometry: RadialGeometry
+    ) -> Tensor:
+        """Any device and dtype, differentiable also in positions: convolutions of what each edge sends."""
         to_scalars, to_vectors = geometry.messages(features, self.in_channels, self.message)
-        scalars = convolve(to_scalars, self.scalar_filters, geometry.reads)
+        scalars = convolve(to_scalars, scalar_filters, geometry.reads)
         if self.out_channels.vectors == 0:
             return scalars
-        vectors = [convolve(component, self.vector_filters, geometry.reads) for component in to_vectors]
+        vectors = [convolve(component, vector_filters, geometry.reads) for component in to_vectors]
         return join_kinds(scalars, torch.stack(vectors, dim=2))
 
     def _check(self, features: Tensor, geometry: RadialGeometry) -> None:

@@ -22,13 +22,11 @@ import torch
 from torch import Tensor
 
 from cconv.ops import gathers, general
+from cconv.ops.blocks import Sums, for_blocks, for_ranges
 from cconv.ops.filter_reads import FilterReads
 from cconv.ops.products import linear
-from cconv.ops.workers import run_on_workers
 
-_BLOCK_BYTES = 3 * 2**19  # size of the columns that a thread works on: about a core's cache
 _PRODUCT_BYTES = 2**25  # size of the products between multiplication and reading
-_VALUES_PER_WORKER = 2**19  # set or read: fewer cost less than waking a thread
 
 Rows = tuple[np.ndarray, np.ndarray | None, np.ndarray]  # splits, order of the edges, neighbour of each edge
 
@@ -47,7 +45,7 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
     """As `general.columns`, in one piece; not differentiable."""
     gathered = features.new_empty(reads.num_receivers, reads.num_cells, features.shape[1])
     gather = _gather(features.detach().contiguous(), reads, own)
-    _for_ranges(reads.num_receivers, gathered.numel(), lambda first, last: gather(first, last, gathered[first:last]))
+    for_ranges(reads.num_receivers, gathered.numel(), lambda first, last: gather(first, last, gathered[first:last]))
     return gathered.flatten(1)
 
 
@@ -109,7 +107,7 @@ def _features_derivative(filters: Tensor, gradient: Tensor, reads: FilterReads, 
 
 def _filters_derivative(features: Tensor, filters: Tensor, gradient: Tensor, reads: FilterReads, own: float) -> Tensor:
     num_cells, in_channels, out_channels = filters.shape
-    sums = _Sums(features, (out_channels, num_cells * in_channels))
+    sums = Sums(features, (out_channels, num_cells * in_channels))
     gather = _gather(features, reads, own)
 
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
@@ -132,7 +130,7 @@ def _both_derivatives(
     num_cells, in_channels, out_channels = filters.shape
     weights = filters.permute(1, 0, 2).reshape(in_channels, num_cells * out_channels)
     derivative = torch.empty_like(features)
-    sums = _Sums(features, (in_channels, num_cells * out_channels))
+    sums = Sums(features, (in_channels, num_cells * out_channels))
     gather = _gather_transposed(gradient, reads, own)
 
     def visit(first: int, last: int, columns: Tensor, worker: int) -> None:
@@ -164,54 +162,21 @@ def _read_products(
                 if factor:
                     gathers.read(first, last, *lists, *edges, products, start, products.dtype.type(factor), sums)
 
-        _for_ranges(num_rows, len(reads.senders) * out_channels, visit)
+        for_ranges(num_rows, len(reads.senders) * out_channels, visit)
     return output
-
-
-class _Sums:
-    """A sum to which each worker adds in a tensor of its own."""
-
-    def __init__(self, like: Tensor, shape: tuple[int, int]):
-        self._parts = [like.new_zeros(shape) for _ in range(torch.get_num_threads())]
-
-    def __getitem__(self, worker: int) -> Tensor:
-        return self._parts[worker]
-
-    def total(self) -> Tensor:
-        return sum(self._parts[1:], start=self._parts[0])
 
 
 def _for_blocks(
     num_rows: int, reads: FilterReads, values: Tensor, visit: Callable[[int, int, Tensor, int], None]
 ) -> None:
-    """Call ``visit(first, last, columns, worker)`` for blocks of rows; `columns` (last - first, K^D, C) is not set.
-
-    Which worker visits which block follows from their numbers alone, so that sums come out the same every time.
-    """
+    """Call ``visit(first, last, columns, worker)`` for blocks of rows; `columns` (last - first, K^D, C) is not set."""
     num_cells, channels = reads.num_cells, values.shape[1]
-    row_bytes = max(1, num_cells * channels * values.element_size())
-    threads = _num_workers((num_rows * num_cells + len(reads.senders) * reads.num_corners) * channels)
-    rows = max(16, min(512, _BLOCK_BYTES // row_bytes, -(-num_rows // threads)))
-    workers = max(1, min(threads, -(-num_rows // rows)))
+    num_values = (num_rows * num_cells + len(reads.senders) * reads.num_corners) * channels
 
-    def work(worker: int) -> None:
-        columns = values.new_empty(rows, num_cells, channels)
-        for first in range(worker * rows, num_rows, workers * rows):
-            last = min(first + rows, num_rows)
-            visit(first, last, columns[: last - first], worker)
+    def visit_columns(first: int, last: int, columns: Tensor, worker: int) -> None:
+        visit(first, last, columns.unflatten(1, (num_cells, channels)), worker)
 
-    run_on_workers(work, workers)
-
-
-def _for_ranges(num_rows: int, num_values: int, visit: Callable[[int, int], None]) -> None:
-    """Call ``visit(first, last)`` for one range of rows a worker."""
-    workers = _num_workers(num_values)
-    bounds = [num_rows * worker // workers for worker in range(workers + 1)]
-    run_on_workers(lambda worker: visit(bounds[worker], bounds[worker + 1]), workers)
-
-
-def _num_workers(num_values: int) -> int:
-    return max(1, min(torch.get_num_threads(), num_values // _VALUES_PER_WORKER))
+    for_blocks(num_rows, num_cells * channels, values, num_values, visit_columns)
 
 
 def _by_receiver(reads: FilterReads) -> Rows:

@@ -6,11 +6,12 @@ is fast only for few outputs. Compiled as in `gathers`, but that sums may also c
 
 import numpy as np
 import torch
-from numba import int32, uintp
+from numba import uintp
 from torch import Tensor
 
 from cconv.compiled import compile_cached
 from cconv.neighbors import Edges
+from cconv.ops.radial_gathers import place, point, scale
 from cconv.ops.workers import run_on_workers
 
 _compile = compile_cached(nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
@@ -94,10 +95,10 @@ def _convolve_rows(
     for start in range(splits[first], splits[last], EDGES_AT_A_TIME):
         end = min(start + EDGES_AT_A_TIME, splits[last])
         count = uintp(end - start)
-        _place(distances[start:end], cutoff, scalar_filters.shape[2] - 1, lower, shares)
+        place(distances[start:end], cutoff, scalar_filters.shape[2] - 1, lower, shares)
         if weights is not None:
-            _scale(weights[start:end], shares)
-        _point(displacements[start:end], distances[start:end], directions)
+            scale(weights[start:end], shares)
+        point(displacements[start:end], distances[start:end], directions)
         pairs = receivers[start:end], senders[start:end]
         _gather(*pairs, features[:, :scalars], own_scalars, messages)
         _gather(*pairs, features[:, scalars:], own_vectors, messages[scalars + vectors :])
@@ -105,35 +106,6 @@ def _convolve_rows(
         _set_scalars(messages, scalar_filters, lower, shares, count, terms)
         _set_vectors(messages, directions, vector_filters, lower, shares, count, scalars, terms[len(scalar_filters) :])
         row = _add_to_rows(terms, start, end, row, splits, output)
-
-
-@_compile
-def _place(distances, cutoff, num_terms, lower, shares):
-    """Set the index of the filter value at or below each distance, and the weights of it and the next."""
-    one, steps = distances.dtype.type(1), distances.dtype.type(num_terms - 1)
-    largest = int32(max(num_terms - 2, 0))
-    for k in range(uintp(len(distances))):
-        place = distances[k] / cutoff * steps
-        lower[k] = min(int32(place), largest)
-        shares[1, k] = min(place - distances.dtype.type(lower[k]), one)
-        shares[0, k] = one - shares[1, k]
-
-
-@_compile
-def _scale(weights, shares):
-    for k in range(uintp(len(weights))):
-        shares[0, k] *= weights[k]
-        shares[1, k] *= weights[k]
-
-
-@_compile
-def _point(displacements, distances, directions):
-    """Set the directions (D, E) from receivers to senders, 0 where two points coincide."""
-    one = distances.dtype.type(1)
-    for k in range(uintp(len(distances))):
-        inverse = -one / (distances[k] if distances[k] > 0 else one)
-        for axis in range(uintp(len(directions))):
-            directions[axis, k] = displacements[k, axis] * inverse
 
 
 @_compile

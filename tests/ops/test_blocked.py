@@ -9,7 +9,7 @@ import torch
 
 from cconv.neighbors import radius_graph
 from cconv.nn import ConvGeometry
-from cconv.ops import blocked, general
+from cconv.ops import blocked, blocks, general
 
 ORDERS = ("gather_then_multiply", "multiply_then_read")
 OWN = (0, -1, 1)
@@ -78,9 +78,9 @@ def test_agrees_however_the_work_is_cut(generator, monkeypatch, restored_threads
     reads = reads_of(generator, 3, "linear", num_points=200)
     expected = {}
     for block, products, per_worker, threads in ((2**21, 2**25, 2**18, 1), (1, 1, 1, 1), (1, 1000, 1, 2)):
-        monkeypatch.setattr(blocked, "_BLOCK_BYTES", block)
+        monkeypatch.setattr(blocks, "_BLOCK_BYTES", block)
         monkeypatch.setattr(blocked, "_PRODUCT_BYTES", products)
-        monkeypatch.setattr(blocked, "_VALUES_PER_WORKER", per_worker)
+        monkeypatch.setattr(blocks, "_VALUES_PER_WORKER", per_worker)
         torch.set_num_threads(threads)
         for order, own, channels in itertools.product(ORDERS, OWN, [(5, 1), (3, 4), (1, 6)]):
             inputs = tensors(torch.Generator().manual_seed(1), reads, *channels)

@@ -29,7 +29,7 @@ def both_ways(layer, features, geometry):
     assert "reads" not in vars(geometry)
     found = layer(features, geometry)
     assert "reads" not in vars(geometry)  # what the general path needs was not made
-    return found, layer._convolve_generally(features, geometry)
+    return found, layer._convolve_generally(features, *filters, geometry)
 
 
 @pytest.mark.parametrize("message", ["absolute", "difference", "sum", "mixed", "opposite"])
