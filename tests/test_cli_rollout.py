@@ -1,11 +1,14 @@
 """A step is fitted, trained, evaluated and rolled out from the command line."""
 
 import json
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
+from outcomes import assert_one_clear_line
 
 from cconv.cli import main
 from cconv.data.dataset import open_dataset
@@ -178,6 +181,20 @@ def test_a_network_of_several_layers_is_trained_on_noisy_windows(steps_folder, c
     assert "(rollout MSE)" in printed
     lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
     assert [json.loads(line)["updates"] for line in lines] == [3, 6]
+
+
+def test_a_test_split_too_short_for_rollouts_is_told_before_anything_is_trained(steps_folder, cconv, tmp_path):
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        for name in ("position", "velocity"):
+            first = file["00000"][name][:7]
+            del file["00000"][name]
+            file["00000"][name] = first
+    space = Path(__file__).parents[1] / "search_spaces" / "rollout.toml"
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1).replace("none.toml", str(space)))
+    outcome = cconv("study", "run", tmp_path / "study.toml", "--data", tmp_path / "data", "--out", tmp_path / "run")
+    assert_one_clear_line(outcome, "trajectory test/00000: has 7 frames, too few for a window of 3 and 5 after it")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
