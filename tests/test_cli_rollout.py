@@ -124,6 +124,20 @@ def test_what_cannot_be_rolled_out_is_one_line(options, reason, fitted, cconv):
     assert len(printed.strip().splitlines()) == 1
 
 
+def test_data_without_masses_are_refused_before_the_rollout(steps_folder, cconv, tmp_path):
+    """Densities relative to that of rest would be no numbers, which no JSON holds."""
+    settings = ("--set", 'task.features=["velocity", "accelerations"]')
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1))
+    fit = ("fit", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "model", *settings)
+    assert cconv(*fit)[0] == 0
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        file["00000/mass"][:] = 0
+    outcome = cconv("rollout", tmp_path / "model", "--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert_one_clear_line(outcome, "mean mass of the fluid must be positive, got 0", "--mass")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_that_holds_something_is_left_alone(fitted, cconv, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     code, _, printed = cconv("rollout", fitted, "--out", tmp_path)
