@@ -68,7 +68,8 @@ class Problem:
                 f"`training.noise` and `training.pushforward` must be 0 for the field {self.task.name!r}, got "
                 f"{training.noise:g} and {training.pushforward}."
             )
-        pushforward = Pushforward(training.pushforward, round(training.pushforward_from * training.updates))
+        begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
+        pushforward = Pushforward(training.pushforward, begins)
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)
 
     @cached_property
