@@ -124,6 +124,22 @@ def test_what_cannot_be_rolled_out_is_one_line(options, reason, fitted, cconv):
     assert len(printed.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(("key", "what"), [("dx", "particle spacing"), ("dt", "time between frames")])
+def test_what_a_step_was_not_trained_at_is_told_with_both_values(key, what, fitted, steps_folder, cconv, tmp_path):
+    scene = open_dataset(steps_folder).scene
+    trained = {"dx": scene.particle_spacing, "dt": scene.frame_dt}[key]
+    shutil.copytree(steps_folder, tmp_path / "data")
+    metadata = json.loads((steps_folder / "metadata.json").read_text())
+    (tmp_path / "data" / "metadata.json").write_text(json.dumps(metadata | {key: 1.1 * metadata[key]}))
+    code, _, printed = cconv("rollout", fitted, "--data", tmp_path / "data", "--frames", 3)
+    assert code == 0
+    assert f"a {what} of {1.1 * trained:g}, and the model was trained at {trained:g}; a step" in printed
+    code, printed, _ = cconv("evaluate", fitted, "--data", tmp_path / "data")
+    assert f"{what.capitalize()} {1.1 * trained:g}; the model was trained at {trained:g}" in printed
+    same = cconv("rollout", fitted, "--frames", 3), cconv("evaluate", fitted)
+    assert not [outcome for outcome in same if "trained at" in outcome[1] + outcome[2]]
+
+
 def test_data_without_masses_are_refused_before_the_rollout(steps_folder, cconv, tmp_path):
     """Densities relative to that of rest would be no numbers, which no JSON holds."""
     settings = ("--set", 'task.features=["velocity", "accelerations"]')
