@@ -76,6 +76,12 @@ def _check_path(path: str) -> str:
     return path
 
 
+def _check_inside(path: str) -> str:
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise ValueError("a path must lead to a place inside of the folder")
+    return path
+
+
 def _check_value(value: object) -> object:
     number = isinstance(value, int | float) and abs(value) <= LARGEST_VALUE  # no nan either
     text = isinstance(value, str) and len(value) <= 200 and value.isprintable()
@@ -88,6 +94,7 @@ Name = Annotated[str, AfterValidator(_check_name)]  # of a study, stage or final
 Id = Annotated[str, AfterValidator(partial(_check_name, longest=160))]  # made of a name and what follows from it
 Text = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_check_text)]
 PathText = Annotated[str, Field(max_length=LONGEST_TEXT), AfterValidator(_check_path)]
+InnerPath = Annotated[PathText, AfterValidator(_check_inside)]  # of a record, relative to its folder
 Value = Annotated[bool | int | float | str, PlainValidator(_check_value)]  # of a hyperparameter
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -1,12 +1,15 @@
 """A step is fitted, trained, evaluated and rolled out from the command line."""
 
 import json
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 from conftest import run_main
+from outcomes import assert_one_clear_line
 
 from cconv.data.dataset import open_dataset
 
@@ -112,6 +115,36 @@ def test_what_cannot_be_rolled_out_is_one_line(options, reason, fitted, cconv):
     assert len(printed.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(("key", "what"), [("dx", "particle spacing"), ("dt", "time between frames")])
+def test_what_a_step_was_not_trained_at_is_told_with_both_values(key, what, fitted, steps_folder, cconv, tmp_path):
+    scene = open_dataset(steps_folder).scene
+    trained = {"dx": scene.particle_spacing, "dt": scene.frame_dt}[key]
+    shutil.copytree(steps_folder, tmp_path / "data")
+    metadata = json.loads((steps_folder / "metadata.json").read_text())
+    (tmp_path / "data" / "metadata.json").write_text(json.dumps(metadata | {key: 1.1 * metadata[key]}))
+    code, _, printed = cconv("rollout", fitted, "--data", tmp_path / "data", "--frames", 3)
+    assert code == 0
+    assert f"a {what} of {1.1 * trained:g}, and the model was trained at {trained:g}; a step" in printed
+    code, printed, _ = cconv("evaluate", fitted, "--data", tmp_path / "data")
+    assert f"{what.capitalize()} {1.1 * trained:g}; the model was trained at {trained:g}" in printed
+    same = cconv("rollout", fitted, "--frames", 3), cconv("evaluate", fitted)
+    assert not [outcome for outcome in same if "trained at" in outcome[1] + outcome[2]]
+
+
+def test_data_without_masses_are_refused_before_the_rollout(steps_folder, cconv, tmp_path):
+    """Densities relative to that of rest would be no numbers, which no JSON holds."""
+    settings = ("--set", 'task.features=["velocity", "accelerations"]')
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1))
+    fit = ("fit", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "model", *settings)
+    assert cconv(*fit)[0] == 0
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        file["00000/mass"][:] = 0
+    outcome = cconv("rollout", tmp_path / "model", "--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert_one_clear_line(outcome, "mean mass of the fluid must be positive, got 0", "--mass")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_folder_that_holds_something_is_left_alone(fitted, cconv, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     code, _, printed = cconv("rollout", fitted, "--out", tmp_path)
@@ -169,6 +202,20 @@ def test_a_network_of_several_layers_is_trained_on_noisy_windows(steps_folder, c
     assert "(rollout MSE)" in printed
     lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
     assert [json.loads(line)["updates"] for line in lines] == [3, 6]
+
+
+def test_a_test_split_too_short_for_rollouts_is_told_before_anything_is_trained(steps_folder, cconv, tmp_path):
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        for name in ("position", "velocity"):
+            first = file["00000"][name][:7]
+            del file["00000"][name]
+            file["00000"][name] = first
+    space = Path(__file__).parents[1] / "search_spaces" / "rollout.toml"
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1).replace("none.toml", str(space)))
+    outcome = cconv("study", "run", tmp_path / "study.toml", "--data", tmp_path / "data", "--out", tmp_path / "run")
+    assert_one_clear_line(outcome, "trajectory test/00000: has 7 frames, too few for a window of 3 and 5 after it")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from cconv.evaluation.objectives import Objective
     from cconv.models.model import Model
 
+TRAINED_AT = (
+    ("particle_spacing", "particle spacing", 1e-6),
+    ("frame_dt", "time between frames", 0.01),
+)  # with tolerance
+
 
 def train(
     study: StudyFile,
@@ -167,6 +172,8 @@ def evaluate(
         "num_parameters": model.num_parameters,
         "particle_spacing": dataset.scene.particle_spacing,
         "trained_at_particle_spacing": model.config.particle_spacing,
+        "frame_dt": dataset.scene.frame_dt,
+        "trained_at_frame_dt": model.config.frame_dt,
     }
     if not math.isfinite(facts[objective.name]):
         raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
@@ -217,9 +224,10 @@ def _print_evaluation(facts: Mapping, objective: "Objective") -> None:
         lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
     if mean is not None:
         lines.append(f"Predicting the mean of the training split here: {mean:.4g}")
-    spacing, trained = facts["particle_spacing"], facts["trained_at_particle_spacing"]
-    if not math.isclose(spacing, trained, rel_tol=1e-6):
-        lines.append(f"Particle spacing {spacing:g}; the model was trained at {trained:g}")
+    for name, what, tolerance in TRAINED_AT:
+        found, trained = facts[name], facts[f"trained_at_{name}"]
+        if trained is not None and not math.isclose(found, trained, rel_tol=tolerance):
+            lines.append(f"{what.capitalize()} {found:g}; the model was trained at {trained:g}")
     for line in lines:
         results.print(line, soft_wrap=True)
 

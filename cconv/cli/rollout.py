@@ -8,12 +8,15 @@ import typer
 
 from cconv.cli.console import errors, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, parse_vector
+from cconv.cli.model import TRAINED_AT
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError
 
 if TYPE_CHECKING:
     from cconv.data.dataset import Dataset
+    from cconv.data.trajectory import Scene
     from cconv.evaluation.recorded_rollout import RecordedRollout
+    from cconv.models.model import ModelConfig
 
 METRICS, ANIMATION = "metrics.json", "rollout.gif"
 SOLVER_REPEATS = 3
@@ -76,7 +79,6 @@ def rollout(
         "force": None if force is None else parse_vector(force),
     }
     dataset, _ = open_card_data(card, data, given)
-    _warn_of_spacing(dataset.scene.particle_spacing, model.config.particle_spacing)
     if out is not None:
         _check_free(out)
     stored = dataset.trajectory(split, trajectory)
@@ -85,6 +87,7 @@ def rollout(
     recorded = record_rollout(model, window_at(stored, present, history, future), dataset.scene, show_progress)
     if not len(recorded.positions):
         raise ConfigError(f"{checkpoint}: no frame was predicted ({recorded.ended}); there is nothing to compare.")
+    _warn_of_scales(dataset.scene, model.config)
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
     facts["solver"] = _solver_facts(dataset, recorded)
@@ -124,14 +127,16 @@ def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
     return {"milliseconds_per_frame": cost.ms_per_frame, "low": cost.ms_low, "high": cost.ms_high, "steps": cost.steps}
 
 
-def _warn_of_spacing(found: float, trained: float) -> None:
-    if not math.isclose(found, trained, rel_tol=1e-6):
-        errors.print(
-            f"cconv: the data have a particle spacing of {found:g}, and the model was trained at {trained:g}; a step "
-            "to the next frame holds for the spacing and the time between frames that it was trained at.",
-            style="yellow",
-            soft_wrap=True,
-        )
+def _warn_of_scales(scene: "Scene", config: "ModelConfig") -> None:
+    for name, what, tolerance in TRAINED_AT:
+        found, trained = getattr(scene, name), getattr(config, name)
+        if trained is not None and not math.isclose(found, trained, rel_tol=tolerance):
+            errors.print(
+                f"cconv: the data have a {what} of {found:g}, and the model was trained at {trained:g}; a step to the "
+                "next frame holds for the spacing and the time between frames that it was trained at.",
+                style="yellow",
+                soft_wrap=True,
+            )
 
 
 def _check_free(out: Path) -> None:

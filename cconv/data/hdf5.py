@@ -32,7 +32,7 @@ from cconv.data.metadata import (
 from cconv.data.source import SPLITS, STORED, Given, as_floats, as_tensor, check_array, check_finite, uniform_masses
 from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory, finite_difference_velocities
 from cconv.domain import Box
-from cconv.errors import DataError
+from cconv.errors import CConvError, DataError
 
 FILES = (*(f"{split}.h5" for split in SPLITS), METADATA)
 FRAMES_PER_CHUNK = 8
@@ -293,7 +293,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except DataError:
+    except CConvError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError) as error:
         what = "is empty" if path.stat().st_size == 0 else f"is truncated or not HDF5 ({one_line(error)})"

@@ -101,6 +101,19 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
     )
 
 
+def check_length(trajectory: str, frames: int, history: int, future: int) -> None:
+    """Check that a trajectory of so many frames has a window.
+
+    Raises:
+        DataError: If it is too short.
+    """
+    if frames < history + future:
+        raise DataError(
+            f"trajectory {trajectory}: has {frames} frames, too few for a window of {history} and {future} after it; "
+            "lower the history or the horizon, or store more frames."
+        )
+
+
 class Windows(Sequence[Window]):
     """All windows of some trajectories, or every one at a stride, each cut out when it is asked for.
 
@@ -130,11 +143,7 @@ class Windows(Sequence[Window]):
         ]
 
     def _presents(self, trajectory: Trajectory, stride: int) -> range:
-        if len(trajectory) < self._history + self._future:
-            raise DataError(
-                f"trajectory {trajectory.name}: has {len(trajectory)} frames, too few for a window of {self._history} "
-                f"and {self._future} after it; lower the history, or store more frames."
-            )
+        check_length(trajectory.name, len(trajectory), self._history, self._future)
         return range(self._history - 1, len(trajectory) - self._future, stride)
 
     def __len__(self) -> int:

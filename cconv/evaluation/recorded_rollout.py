@@ -14,7 +14,7 @@ from cconv.data.dataset import Dataset
 from cconv.data.hdf5 import write_dataset
 from cconv.data.trajectory import Scene, Trajectory, finite_difference_velocities
 from cconv.data.window import Window
-from cconv.evaluation.rollout_comparison import rollout_metrics
+from cconv.evaluation.rollout_comparison import check_masses, rollout_metrics
 from cconv.models.model import Model
 from cconv.rollout.rollout import Diverged, rollout
 
@@ -54,7 +54,12 @@ class RecordedRollout:
 def record_rollout(
     model: Model, start: Window, scene: Scene, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
 ) -> RecordedRollout:
-    """Roll a model out for as many frames as are stored after a window; Ctrl-C keeps the frames so far."""
+    """Roll a model out for as many frames as are stored after a window; Ctrl-C keeps the frames so far.
+
+    Raises:
+        DataError: If the fluid has no mass, without which the rollout could not be measured.
+    """
+    check_masses(start.masses, start.is_fluid)
     frames: list[Tensor] = []
     times: list[float] = []
     ended = None

@@ -7,7 +7,7 @@ from scipy.stats import wasserstein_distance
 from torch import Tensor
 
 from cconv.data.trajectory import Scene
-from cconv.errors import ConfigError, check_shape
+from cconv.errors import ConfigError, DataError, check_shape
 from cconv.evaluation.particle_distribution import (
     FREE_SURFACE,
     MOST_POINTS,
@@ -86,6 +86,19 @@ class RolloutMetrics:
         return _plain(asdict(self))
 
 
+def check_masses(masses: Tensor, is_fluid: Tensor) -> None:
+    """Check that the fluid has a mass, so that densities relative to that of rest are defined.
+
+    Raises:
+        DataError: If it has none.
+    """
+    mean = float(masses[is_fluid].double().mean())
+    if not mean > 0:
+        raise DataError(
+            f"the mean mass of the fluid must be positive, got {mean:g}; correct the masses or give --mass."
+        )
+
+
 def rollout_metrics(
     positions: Tensor,
     reference: Tensor,
@@ -117,6 +130,7 @@ def rollout_metrics(
     Raises:
         ShapeError: If shapes do not fit.
         ConfigError: If a stride is less than 1, or there are fewer frames.
+        DataError: If the fluid has no mass.
     """
     check_shape("positions", positions.shape, ("frames", len(masses), scene.dim))
     check_shape("reference", reference.shape, tuple(positions.shape))
@@ -125,6 +139,7 @@ def rollout_metrics(
     if sinkhorn_stride < 1:
         raise ConfigError(f"`sinkhorn_stride` must be at least 1, got {sinkhorn_stride}.")
     frames = np.arange(stride, len(positions), stride)
+    check_masses(masses, is_fluid)
     both = positions.double(), reference.double()
     fluid = [path[:, is_fluid] for path in both]
     moving = [speeds(path, scene.box, scene.frame_dt)[frames - 1].numpy() for path in fluid]

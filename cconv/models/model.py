@@ -33,8 +33,8 @@ class ModelConfig(StrictModel):
     """Everything that rebuilds a model except its weights; stored as `config.json`.
 
     The network computes in particle spacings, rest densities and frame intervals (`cconv.tasks.features.Units`).
-    `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` is the spacing of the
-    training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
+    `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` and `frame_dt` are those of
+    the training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
     features of the task that are inputs of the model.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     """
@@ -44,6 +44,7 @@ class ModelConfig(StrictModel):
     relative_smoothing_length: Length
     dim: Whole = Field(ge=1, le=3)
     particle_spacing: Length
+    frame_dt: Length | None = None
     history: Whole = 1
     features: tuple[str, ...] = Field(max_length=100)
     wall_scalars: Whole = Field(ge=0, le=1)
@@ -262,6 +263,7 @@ def build_model(
         relative_smoothing_length=task.relative_smoothing_length,
         dim=scene.dim,
         particle_spacing=scene.particle_spacing,
+        frame_dt=scene.frame_dt,
         history=task.history,
         features=tuple(name for name in task.features if name in names),
         wall_scalars=walls.scalars,

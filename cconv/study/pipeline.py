@@ -24,7 +24,7 @@ from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import OptunaMirror, database_answers, open_mirror
 from cconv.study.running.pool import Pool
 from cconv.study.running.private_folder import remove_left_behind
-from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
+from cconv.study.running.problem import Problem, check_test_split, load_problem, open_study_data, with_data_path
 from cconv.study.running.serial_pool import SerialPool
 from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
@@ -144,6 +144,7 @@ def _session(
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
     dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
+    check_test_split(study, dataset)
     problem = load_problem(study, dataset, progress)
     if not dataset.scene.has_boundary:
         space = fixed(space, feature_path(WALLS))  # nothing to search where there are no walls

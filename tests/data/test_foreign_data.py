@@ -178,6 +178,12 @@ def test_given_numbers_have_a_range(tmp_path, given):
         open_dataset(tmp_path, **given)
 
 
+def test_a_force_of_another_dimension_is_no_damage_of_the_file(tmp_path):
+    write_hdf5(tmp_path)
+    with pytest.raises(ConfigError, match=r"^`force` must have one number an axis \(2\), got 1\.$"):
+        open_dataset(tmp_path, force=(0.0,))
+
+
 def test_markup_and_control_characters_are_shown_as_they_are(cconv, tmp_path):
     mass = np.ones(4, "f4")
     own = {"name": "[/red]\x1b[2J" + "x" * 10_000, "missing": ["[/bold]"], "mass_source": "[link=evil]"}

@@ -159,6 +159,21 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
     )
 
 
+def check_asked(configuration: Configuration, task: str) -> None:
+    """Check that a configuration has no features of another task, and changes windows only where there are some.
+
+    Raises:
+        ConfigError: With the setting.
+    """
+    foreign = [name for name in configuration.features if name not in TASKS[task].features]
+    if foreign:
+        raise ConfigError(f"not possible ({feature_path(foreign[0])}: is no feature of the task {task!r})")
+    training = configuration.training
+    if training.moves_particles and not issubclass(TASKS[task], StepTask):
+        name, value = ("noise", training.noise) if training.noise else ("pushforward", training.pushforward)
+        raise ConfigError(f"not possible ({TRAINING}.{name}: must be 0 for the field {task!r}, got {value:g})")
+
+
 def _possible(form: type[Settings], table: str, values: Mapping[str, Value]) -> Settings:
     """Settings of a table of the study file from plain values."""
     try:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from cconv.errors import ConfigError, shown
@@ -50,15 +51,15 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
     Raises:
         ConfigError: With the parameter and the value.
     """
-    defaults = study.configuration if study else DEFAULTS
+    configured = study.configured if study else partial(configure, defaults=DEFAULTS)
     for name, parameter in space.parameters.items():
         if name not in HYPERPARAMETERS:
             raise ConfigError(f"{source}: unknown hyperparameter `parameters.{name}`.{known_hyperparameters(name)}")
         for value in parameter.extremes:
             values = space.making_active(name) | {name: value}
-            _check_configures(values, defaults, f"{source}: `parameters.{name}`: the value {shown(value)}")
+            _check_configures(values, configured, f"{source}: `parameters.{name}`: the value {shown(value)}")
     _check_conditions_on_architectures(space, source)
-    _check_configures(space.baseline, defaults, f"{source}: the baseline")
+    _check_configures(space.baseline, configured, f"{source}: the baseline")
 
 
 def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -> None:
@@ -75,9 +76,11 @@ def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -
                 )
 
 
-def _check_configures(parameters: Mapping[str, Value], defaults: Configuration, what: str) -> None:
+def _check_configures(
+    parameters: Mapping[str, Value], configured: Callable[[Mapping[str, Value]], Configuration], what: str
+) -> None:
     try:
-        configure(parameters, defaults)
+        configured(parameters)
     except ConfigError as error:
         raise ConfigError(f"{what} is {error}.") from error
 

@@ -14,10 +14,11 @@ from cconv.study.declared.configuration import (
     TaskConfig,
     TrainingConfig,
     Updates,
+    check_asked,
     configure,
 )
 from cconv.study.declared.stage import Stage, check_names, check_order, included
-from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Whole
+from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole
 
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
 _Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
@@ -164,10 +165,15 @@ class StudyConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _configuration_fits_the_task(self) -> "StudyConfig":
+        check_asked(self.configuration, self.task.name)
+        return self
+
+    @model_validator(mode="after")
     def _included_are_possible(self) -> "StudyConfig":
         for finalist, parameters in included(self.stages):
             try:
-                configure(parameters, self.configuration)
+                self.configured(parameters)
             except ConfigError as error:
                 raise ValueError(f"finalist `{finalist}`: {error}") from error
         return self
@@ -176,6 +182,16 @@ class StudyConfig(StrictModel):
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
         return Configuration(self.task.taken, self.network, self.training)
+
+    def configured(self, parameters: Mapping[str, Value]) -> Configuration:
+        """What a trial has for which these hyperparameters are drawn.
+
+        Raises:
+            ConfigError: If they are not possible together, or not for the task.
+        """
+        configuration = configure(parameters, self.configuration)
+        check_asked(configuration, self.task.name)
+        return configuration
 
     @property
     def rungs(self) -> list[int]:

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from cconv.study.records.forms import Count, NonNegative
 from cconv.study.records.found import Interval, Parts
-from cconv.validation import Flag, Id, Name, PathText, Real, StrictModel, Value
+from cconv.validation import Flag, Id, InnerPath, Name, PathText, Real, StrictModel, Value
 
 
 class TaskFacts(StrictModel):
@@ -218,7 +218,7 @@ class FinalistEntry(StrictModel):
     test: Errors
     cost: ModelCost
     stability: Stability
-    checkpoint: PathText
+    checkpoint: InnerPath
     train_seconds: NonNegative
 
 

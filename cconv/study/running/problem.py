@@ -10,6 +10,7 @@ import torch
 from cconv.data.dataset import Dataset, open_dataset
 from cconv.data.metadata import OVERRIDES
 from cconv.data.trajectory import Scene
+from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.model import Model, absent_features, build_model
@@ -67,7 +68,8 @@ class Problem:
                 f"`training.noise` and `training.pushforward` must be 0 for the field {self.task.name!r}, got "
                 f"{training.noise:g} and {training.pushforward}."
             )
-        pushforward = Pushforward(training.pushforward, round(training.pushforward_from * training.updates))
+        begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
+        pushforward = Pushforward(training.pushforward, begins)
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)
 
     @cached_property
@@ -129,6 +131,19 @@ def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[
     if isinstance(task, StepTask) and split == "train":
         return learned_samples(dataset, split, task, further=MOST_PUSHED)
     return compared_samples(dataset, split, task, study.task.horizon or HORIZON)
+
+
+def check_test_split(study: StudyConfig, dataset: Dataset) -> None:
+    """Check that the test split, which is read at the end alone, has frames enough for the rollouts of a step task.
+
+    Raises:
+        DataError: With the trajectory that has too few.
+    """
+    task = study_task(study.task, dataset.scene)
+    if isinstance(task, StepTask):
+        for block in dataset.splits["test"]:
+            horizon = study.task.horizon or HORIZON
+            check_length(block.trajectory, dataset.num_frames(block), task.history, horizon)
 
 
 def study_task(task: TaskConfig, scene: Scene) -> Task:

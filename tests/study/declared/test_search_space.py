@@ -301,6 +301,27 @@ def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
         load_space(path, study)
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "baseline", "message"),
+    [
+        (
+            "training.noise",
+            "[0.0, 0.1]",
+            "0.0",
+            r"the value 0\.1 is not possible .training\.noise: must be 0 for the field",
+        ),
+        ("training.pushforward", "[0, 3]", "0", "the value 3 is not possible .*must be 0 for the field"),
+        ("task.features.force", "[true, false]", "false", "the value True is not possible .*no feature of the task"),
+    ],
+)
+def test_what_only_steps_have_is_refused_in_the_space_of_a_field(name, values, baseline, message, space_file):
+    """Trials would end the study only after others were trained."""
+    path = space_file(f'[parameters.{name}]\ntype = "choice"\nvalues = {values}\nbaseline = {baseline}\nreason = "r"\n')
+    with pytest.raises(ConfigError, match=message):
+        load_space(path, load_study(REPOSITORY / "experiments" / "smoke.toml"))
+    load_space(path, load_study(REPOSITORY / "experiments" / "rollout.toml"))
+
+
 def test_layers_of_a_huge_space_are_drawn_without_listing_them():
     """2e13 layers, of which no more than a limit are ever held."""
     choices = {

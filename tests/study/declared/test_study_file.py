@@ -63,6 +63,8 @@ def test_settings_replace_those_of_the_file(study_file):
         ("trial_seconds = 1e300", r"`search\.trial_seconds`: input should be less than or equal to 10000000"),
         ("concurrency = true", r"`search\.concurrency`: input should be a valid integer, got True"),
         ("trial_seconds = true", r"`search\.trial_seconds`: input should be a valid number, got True"),
+        ("[training]\nnoise = 0.1", r"not possible .training\.noise: must be 0 for the field 'density_rate', got 0\.1"),
+        ("[training]\npushforward = 2", r"not possible .training\.pushforward: must be 0 for the field 'density_rate'"),
         ("[training]\nlearning_rate = 1e-300", r"`training\.learning_rate`: input should be greater than"),
         ("[training]\nlearning_rate = nan", r"`training\.learning_rate`: input should be a finite number"),
         ("[data]\nmass = inf", r"`data\.mass`: input should be a finite number"),
@@ -165,6 +167,8 @@ def test_names_that_could_be_taken_for_others_are_refused(stages, message, study
         ),
         ("{ training.learning_rate = inf }", r"include\.x\.training\.learning_rate`: must be true, false, a number"),
         ("{ network.layers = [1] }", r"include\.x\.network\.layers`: must be true, false, a number"),
+        ("{ training.noise = 0.1 }", r"finalist `x`: not possible .training\.noise: must be 0 for the field"),
+        ("{ task.features.force = true }", r"finalist `x`: not possible .task\.features\.force: is no feature of"),
     ],
 )
 def test_an_included_configuration_is_checked_when_the_study_is_loaded(parameters, message, study_file):

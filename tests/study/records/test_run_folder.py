@@ -262,6 +262,10 @@ def of_another(content):
     content["recommended"]["id"] = "another"
 
 
+def elsewhere(path):
+    return lambda content: content["finalists"][1].update(checkpoint=path)
+
+
 def misspelt(content):
     content["selection"]["tide"] = content["selection"].pop("tied")
 
@@ -272,6 +276,8 @@ def misspelt(content):
         (without("study"), "`study` is missing"),
         (negative_error, r"`finalists\.1\.test\.error`: .* greater than or equal to 0, got -1"),
         (of_another, "`recommended.id` must be that of one of `finalists`"),
+        (elsewhere("../../evil"), r"`finalists\.1\.checkpoint`: a path must lead to a place inside of the folder"),
+        (elsewhere("/tmp/evil"), r"`finalists\.1\.checkpoint`: a path must lead to a place inside of the folder"),
         (misspelt, r"unknown key `selection\.tide`\. Did you mean 'tied'"),
     ],
 )
