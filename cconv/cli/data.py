@@ -1,7 +1,7 @@
 """`cconv data`: make, look at and convert particle data."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -296,18 +296,24 @@ def parse_vector(text: str) -> tuple[float, ...]:
         raise ConfigError(f"`--force` must be numbers separated by commas, such as 0,-9.81,0, got {text!r}.") from error
 
 
+def given_facts(
+    mass: float | None, particle_spacing: float | None, frame_dt: float | None, force: str | None
+) -> dict[str, Any]:
+    """What a user says of the data, by the names of `open_dataset`; None where he does not.
+
+    Raises:
+        ConfigError: If the force is no vector.
+    """
+    vector = None if force is None else parse_vector(force)
+    return {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": vector}
+
+
 def _open(
     path: Path, mass: float | None, particle_spacing: float | None, frame_dt: float | None, force: str | None
 ) -> "Dataset":
     from cconv.data.dataset import open_dataset
 
-    return open_dataset(
-        path,
-        mass=mass,
-        particle_spacing=particle_spacing,
-        frame_dt=frame_dt,
-        force=None if force is None else parse_vector(force),
-    )
+    return open_dataset(path, **given_facts(mass, particle_spacing, frame_dt, force))
 
 
 def _table(facts: dict) -> Table:

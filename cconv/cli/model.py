@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cconv.cli.console import errors, print_findings, print_json, results, show_progress
-from cconv.cli.data import Force, FrameDt, Mass, Spacing, parse_vector
+from cconv.cli.data import Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.live import TrainingBar
 from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
@@ -146,12 +146,7 @@ def evaluate(
     if horizon is not None:
         check_setting(Horizon, horizon, "--horizon")
     model, card = load_model(checkpoint, task), read_card(checkpoint)
-    given = {
-        "mass": mass,
-        "particle_spacing": particle_spacing,
-        "frame_dt": frame_dt,
-        "force": None if force is None else parse_vector(force),
-    }
+    given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     rolled = horizon or card.get("horizon") or HORIZON
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cconv.cli.console import errors, print_json, results, show_progress
-from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, parse_vector
+from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.model import TRAINED_AT
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError
@@ -72,12 +72,7 @@ def rollout(
     checkpoint = _recommended(checkpoint)
     model, card = load_model(checkpoint), read_card(checkpoint)
     history = as_step(model.task).history
-    given = {
-        "mass": mass,
-        "particle_spacing": particle_spacing,
-        "frame_dt": frame_dt,
-        "force": None if force is None else parse_vector(force),
-    }
+    given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, _ = open_card_data(card, data, given)
     if out is not None:
         _check_free(out)
