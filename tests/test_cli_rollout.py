@@ -131,6 +131,17 @@ def test_what_a_step_was_not_trained_at_is_told_with_both_values(key, what, fitt
     assert not [outcome for outcome in same if "trained at" in outcome[1] + outcome[2]]
 
 
+def test_suspicious_other_data_are_told(fitted, steps_folder, cconv, tmp_path):
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        file["00000/position"][12] = file["00000/position"][11]
+    for command in ("rollout", "evaluate"):
+        status, _, error = cconv(command, fitted, "--data", tmp_path / "data", "--json")
+        assert status == 0
+        assert error.startswith("cconv: suspicious data: trajectory test/00000, frame 12: ")
+        assert cconv(command, fitted, "--json")[2] == ""
+
+
 def test_data_without_masses_are_refused_before_the_rollout(steps_folder, cconv, tmp_path):
     """Densities relative to that of rest would be no numbers, which no JSON holds."""
     settings = ("--set", 'task.features=["velocity", "accelerations"]')

@@ -138,6 +138,7 @@ def evaluate(
     Masses, spacing and time step are read from the data or given here. Those in the checkpoint are only used for the
     data that it was trained on.
     """
+    from cconv.data.plausibility import dataset_findings
     from cconv.evaluation.objectives import objective_of
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
@@ -172,6 +173,8 @@ def evaluate(
     }
     if not math.isfinite(facts[objective.name]):
         raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
+    if not is_own:
+        print_findings(dataset_findings(dataset, show_progress, [split]))
     if as_json:
         print_json(facts)
         return

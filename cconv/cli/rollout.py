@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.model import TRAINED_AT
 from cconv.cli.study import DataPath
@@ -59,6 +59,7 @@ def rollout(
     The model is given a window of stored frames and predicts the next frame; from that it predicts the one after, and
     so on. Ctrl-C keeps the frames so far. The exit status is 1 if the rollout diverged.
     """
+    from cconv.data.plausibility import trajectory_findings
     from cconv.data.window import window_at
     from cconv.evaluation.recorded_rollout import record_rollout, rollout_facts
     from cconv.models.checkpoint import load_model, read_card
@@ -73,7 +74,7 @@ def rollout(
     model, card = load_model(checkpoint), read_card(checkpoint)
     history = as_step(model.task).history
     given = given_facts(mass, particle_spacing, frame_dt, force)
-    dataset, _ = open_card_data(card, data, given)
+    dataset, is_own = open_card_data(card, data, given)
     if out is not None:
         _check_free(out)
     stored = dataset.trajectory(split, trajectory)
@@ -83,6 +84,8 @@ def rollout(
     if not len(recorded.positions):
         raise ConfigError(f"{checkpoint}: no frame was predicted ({recorded.ended}); there is nothing to compare.")
     _warn_of_scales(dataset.scene, model.config)
+    if not is_own:
+        print_findings(trajectory_findings(stored, dataset.scene))
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
     facts["solver"] = _solver_facts(dataset, recorded)

@@ -59,18 +59,21 @@ class DataFinding:
 
 
 def dataset_findings(
-    dataset: Dataset, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
+    dataset: Dataset,
+    progress: Callable[[Iterable, str], Iterable] = lambda items, _: items,
+    splits: Sequence[str] | None = None,
 ) -> list[DataFinding]:
-    """Find the implausibilities of a data set; every trajectory of every split is read, one at a time.
+    """Find the implausibilities of a data set; every trajectory of its splits is read, one at a time.
 
     Args:
         dataset: The data set.
-        progress: Wraps the blocks of all splits to show progress, given a label.
+        progress: Wraps the blocks of the splits to show progress, given a label.
+        splits: Names of the splits; None for all.
 
     Raises:
         DataError: If the data are damaged.
     """
-    blocks = [(split, k) for split, members in dataset.splits.items() for k in range(len(members))]
+    blocks = [(split, k) for split in splits or dataset.splits for k in range(len(dataset.splits[split]))]
     found = (trajectory_findings(dataset.trajectory(*block), dataset.scene) for block in progress(blocks, "check data"))
     return first_of_each([finding for findings in found for finding in findings])
 
