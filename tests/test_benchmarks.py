@@ -14,6 +14,7 @@ from particle_files import record_frames, write_parts
 from processes import PATIENCE
 
 from cconv.evaluation.cost import ANALYTIC
+from cconv.scenes import scene_named
 
 
 def run(script, *arguments):
@@ -77,3 +78,13 @@ def test_edges_have_the_neighbours_that_were_asked_for(benchmark_script, generat
     positions = torch.rand(500, 3, generator=generator)
     edges = benchmark_script("continuous_conv").edges_with(positions, 20)
     assert len(edges) / 500 == pytest.approx(20, rel=0.05)
+
+
+def test_the_decay_of_vortices_is_checked_with_the_solver_that_makes_data_and_with_a_transport_velocity(
+    solver_benchmark,
+):
+    scene = scene_named("taylor_green_2d", particle_spacing=0.04)
+    solvers = {name: solver_of(scene) for name, solver_of in solver_benchmark.TAYLOR_GREEN_SOLVERS.items()}
+    pressures = {name: solver._scheme.transport_pressure for name, solver in solvers.items()}
+    assert pressures["as data are made"] == scene.solver()._scheme.transport_pressure == 0
+    assert pressures["transport velocity"] > 0

@@ -1,6 +1,7 @@
 """Generated data sets: same bytes for a seed, split, cut in time, resumed after a kill, never half-written."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,11 @@ from safetensors import SafetensorError
 
 from cconv.data import generate as module
 from cconv.data.dataset import open_dataset
-from cconv.data.generate import generate
+from cconv.data.generate import SPLIT_FRACTIONS, generate
 from cconv.data.simulate import simulate
+from cconv.data.splits import share_out
 from cconv.errors import ConfigError, DataError, SimulationError
+from cconv.evaluation.statistics import FEWEST
 from cconv.scenes import scene_named
 
 pytestmark = pytest.mark.integration
@@ -50,6 +53,12 @@ def test_trajectories_are_split_two_to_one_to_one(tmp_path):
     starts = [dataset.trajectory(split, k).positions[0] for split, k in (("train", 0), ("train", 1), ("test", 0))]
     assert not torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[1], starts[2])
+
+
+def test_the_data_of_the_quick_study_have_units_enough_for_intervals():
+    makefile = (Path(__file__).parents[2] / "Makefile").read_text()
+    (count,) = re.findall(r"data generate dam_break_2d .*--trajectories (\d+)", makefile)
+    assert all(share_out(int(count), SPLIT_FRACTIONS)[place] >= FEWEST for place in (1, 2))  # validation and test
 
 
 def test_a_single_trajectory_is_cut_in_time(tmp_path):
