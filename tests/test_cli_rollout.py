@@ -142,6 +142,16 @@ def test_suspicious_other_data_are_told(fitted, steps_folder, cconv, tmp_path):
         assert cconv(command, fitted, "--json")[2] == ""
 
 
+def test_a_solver_that_would_take_hours_is_not_timed(fitted, steps_folder, cconv, tmp_path):
+    shutil.copytree(steps_folder, tmp_path / "data")
+    metadata = json.loads((steps_folder / "metadata.json").read_text())
+    finer = {"dt": 1e-5 * metadata["dt"], "write_every": 10**5 * metadata["write_every"]}
+    (tmp_path / "data" / "metadata.json").write_text(json.dumps(metadata | finer))
+    code, printed, _ = cconv("rollout", fitted, "--data", tmp_path / "data", "--frames", 3)
+    assert code == 0
+    assert "The solver was not timed: a frame is 100,000,000 steps of a particle, more than 10,000,000" in printed
+
+
 def test_data_without_masses_are_refused_before_the_rollout(steps_folder, cconv, tmp_path):
     """Densities relative to that of rest would be no numbers, which no JSON holds."""
     settings = ("--set", 'task.features=["velocity", "accelerations"]')

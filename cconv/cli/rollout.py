@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 METRICS, ANIMATION = "metrics.json", "rollout.gif"
 SOLVER_REPEATS = 3
+MOST_SOLVER_WORK = 10_000_000  # particles times steps of a frame, about 20 s; published sets have up to 800,000
 LONGEST_ANIMATION = 60  # frames; longer rollouts are drawn every few frames
 
 
@@ -118,6 +119,9 @@ def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
     scene, reason = find_scene({"dim": dataset.scene.dim, **dataset.metadata})
     if scene is None:
         return {"not_timed": reason}
+    work = scene.steps_per_frame * len(recorded.start.present)
+    if work > MOST_SOLVER_WORK:
+        return {"not_timed": f"a frame is {work:,} steps of a particle, more than {MOST_SOLVER_WORK:,}"}
     try:
         cost = measure_solver(scene, recorded.start, threads=torch.get_num_threads(), repeats=SOLVER_REPEATS)
     except CConvError as error:

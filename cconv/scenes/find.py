@@ -1,5 +1,6 @@
 """The scene that a data set was made with, found by what its metadata.json says."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from cconv.scenes.simulated_scene import SimulatedScene
 
 KEYS = {"particle_spacing": "dx", "viscosity": "viscosity", "time_step": "dt", "steps_per_frame": "write_every"}
 MOST_STEPS = 1_000_000  # in a frame
+MOST_CELLS = 10_000_000  # of a particle each in the box, before walls are laid out
 
 
 class FoundScene(NamedTuple):
@@ -52,6 +54,9 @@ def _is_setting(name: str, value: object) -> bool:
 def _fitting(kind: type[SimulatedScene], settings: Mapping[str, Any], metadata: Mapping[str, Any]) -> FoundScene:
     try:
         scene = kind(**settings)
+        cells = math.prod(length / scene.particle_spacing for length in scene.box.lengths)
+        if cells > MOST_CELLS:
+            return FoundScene(None, f"{kind.name} would have {cells:.2g} cells of `dx`, more than {MOST_CELLS:,}")
         has_walls = len(scene.walls) > 0
     except ConfigError as error:
         return FoundScene(None, f"{kind.name} cannot have its settings ({error})")

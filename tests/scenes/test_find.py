@@ -51,6 +51,7 @@ def test_the_box_says_the_size():
         ({"p_bg_factor": 0.1}, "`p_bg_factor` is 0.1, and 0.0 in dam_break_2d"),
         ({"free_slip": True}, "`free_slip` is True, and False"),
         ({"bounds": [[0.0, 5.0], [0.0, 2.22]]}, "dam_break_2d does not have the bounds"),
+        ({"dx": 1e-5, "dt": 1e-9}, "dam_break_2d would have 1.1e+11 cells of `dx`, more than 10,000,000"),
         ({"bounds": "wide"}, "dam_break_2d does not have the bounds 'wide'"),
     ],
 )  # fmt: skip
