@@ -97,6 +97,13 @@ def test_the_answer_says_what_it_was_chosen_by_and_what_is_reported(whole_run, w
     assert whole_report.count("<td>predicting the mean</td>") == 3  # finalists, comparisons, trials
 
 
+def test_the_share_of_trials_that_passed_each_rung_is_said_beside_that_which_the_rule_aims_at(whole_run, whole_report):
+    text, stages = words(whole_report), [*whole_run.summary().rungs.values()]
+    assert any(stages)
+    assert all(f"({rung.passed} of {rung.trials})" in text for rungs in stages for rung in rungs)
+    assert "The rule aims at 33 %" in text
+
+
 @pytest.mark.parametrize(("ms", "says"), [(1e-3, True), (1e3, False)])
 def test_the_answer_says_where_analytic_sph_is_cheaper_and_exact(other_run, ms, says, no_charts):
     summary = other_run.summary()
