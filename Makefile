@@ -1,5 +1,5 @@
 # make study   environment, data, the quick study, report
-# make rollout the same for steps that are rolled out: data, the study rollout, a rollout of the recommended model
+# make rollout the same for steps that are rolled out: data, a study of five minutes, a rollout of its best model
 # make test-fast   environment, the tests that start no processes: laws and formats, a minute or two
 # make test    environment, whole test suite, on all cores
 # make test-slow   what takes hours: clusters, kills, cold compilation, a thousand inputs

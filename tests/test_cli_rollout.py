@@ -181,6 +181,20 @@ def test_a_model_of_a_field_is_refused(flow_folder, cconv, tmp_path):
     code, _, printed = cconv("rollout", tmp_path / "model")
     assert code == 2
     assert "the task 'density_rate' is a field, and only steps are possible here" in printed
+    code, _, printed = cconv("evaluate", tmp_path / "model", "--horizon", 5)
+    assert code == 2
+    assert "`--horizon` is for steps, and 'density_rate' is a field" in printed
+
+
+def test_what_ends_the_metrics_loses_no_frame(fitted, cconv, tmp_path, monkeypatch):
+    from cconv.evaluation import recorded_rollout
+
+    def stops(*arguments, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recorded_rollout, "rollout_metrics", stops)
+    assert cconv("rollout", fitted, "--out", tmp_path / "out")[0] == 130
+    assert len(open_dataset(tmp_path / "out").trajectory("test", 0)) == 16
 
 
 def test_ctrl_c_keeps_the_frames_so_far(fitted, cconv, tmp_path, monkeypatch):

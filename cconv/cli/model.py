@@ -143,10 +143,13 @@ def evaluate(
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
     from cconv.tasks.samples import HORIZON, compared_samples
+    from cconv.tasks.task import StepTask
 
     if horizon is not None:
         check_setting(Horizon, horizon, "--horizon")
     model, card = load_model(checkpoint, task), read_card(checkpoint)
+    if horizon is not None and not isinstance(model.task, StepTask):
+        raise ConfigError(f"`--horizon` is for steps, and {model.task.name!r} is a field of one frame; leave it out.")
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     rolled = horizon or card.get("horizon") or HORIZON

@@ -62,7 +62,7 @@ def rollout(
     """
     from cconv.data.plausibility import trajectory_findings
     from cconv.data.window import window_at
-    from cconv.evaluation.recorded_rollout import record_rollout, rollout_facts
+    from cconv.evaluation.recorded_rollout import record_rollout, rollout_facts, write_rollout
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
     from cconv.tasks.task import as_step
@@ -87,11 +87,13 @@ def rollout(
     _warn_of_scales(dataset.scene, model.config)
     if not is_own:
         print_findings(trajectory_findings(stored, dataset.scene))
+    if out is not None:
+        write_rollout(out, recorded, dataset)  # first, so that what ends the rest loses no frame
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
     facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:
-        _write(out, recorded, dataset, facts, vtk)
+        _write_beside(out, recorded, dataset, facts, vtk)
     if as_json:
         print_json(facts)
     else:
@@ -147,13 +149,13 @@ def _check_free(out: Path) -> None:
     check_free(out, (), overwrite=False)
 
 
-def _write(out: Path, recorded: "RecordedRollout", dataset: "Dataset", facts: dict, vtk: bool) -> None:
+def _write_beside(out: Path, recorded: "RecordedRollout", dataset: "Dataset", facts: dict, vtk: bool) -> None:
+    """Write the metrics, an animation and, if asked for, VTK files beside the frames of a rollout."""
     from cconv.data.vtk import write_vtk
-    from cconv.evaluation.recorded_rollout import trajectories_of, write_rollout
+    from cconv.evaluation.recorded_rollout import trajectories_of
     from cconv.files import write_json
     from cconv.report.particles import write_animation
 
-    write_rollout(out, recorded, dataset)
     write_json(out / METRICS, facts)
     both = trajectories_of(recorded, dataset.scene)
     frames = range(0, len(both["rollout"]), math.ceil(len(both["rollout"]) / LONGEST_ANIMATION))
