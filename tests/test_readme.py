@@ -5,18 +5,35 @@ from pathlib import Path
 
 import cconv
 from cconv.models.checkpoint import save_model
+from cconv.models.model import build_model
+from cconv.networks import RadialNetSettings
+from cconv.tasks import task_named
+from cconv.tasks.samples import learned_samples
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "docs" / "python.md"]
 CHECKPOINT = "runs/dpi_density_rate/finalists/baseline/seed_1/checkpoint"
 
 
-def test_the_code_blocks_run(flow_folder, tmp_path):
+STEP_CHECKPOINT = "runs/rollout_taylor_green/checkpoint"
+
+
+def untrained_step(folder):
+    """A model of steps with the weights that it begins with."""
+    flow, task = cconv.open_dataset(folder), task_named("acceleration")
+    samples = list(learned_samples(flow, "train", task))
+    return build_model(RadialNetSettings(layers=1), task, task.features, flow.scene, samples)
+
+
+def test_the_code_blocks_run(flow_folder, steps_folder, tmp_path):
     save_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), tmp_path / "model", {})
+    save_model(untrained_step(steps_folder), tmp_path / "step", {})
     blocks = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     code = "\n".join(blocks)
-    for placeholder, path in {"FOLDER": flow_folder, CHECKPOINT: tmp_path / "model"}.items():
+    places = {"FOLDER": flow_folder, CHECKPOINT: tmp_path / "model"}
+    places |= {"VORTICES": steps_folder, STEP_CHECKPOINT: tmp_path / "step"}
+    for placeholder, path in places.items():
         assert f'"{placeholder}"' in code
         code = code.replace(f'"{placeholder}"', repr(str(path)))
     names = {}
@@ -24,6 +41,7 @@ def test_the_code_blocks_run(flow_folder, tmp_path):
     assert names["features"].shape == (1000, 16)
     assert names["output"].shape == (1000, 1)
     assert names["frame"].positions.shape[1] == 2
+    assert [positions.shape for positions in names["path"]] == [(100, 2)] * 5
 
 
 def test_every_local_link_of_the_pages_leads_somewhere():
