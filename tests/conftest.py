@@ -54,6 +54,14 @@ def generator():
 
 
 @pytest.fixture
+def restored_threads():
+    """Give torch the number of threads back that it had before a test."""
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
 def benchmark_script(monkeypatch):
     """Load a script of experiments/benchmarks as a module, given its name."""
 
@@ -94,30 +102,26 @@ def cconv(capfd):
     return run
 
 
-@pytest.fixture(scope="session")
-def flow_folder(tmp_path_factory):
-    """A small Taylor–Green data set."""
+def generate_vortices(folder, steps_per_frame, num_frames):
+    """Generate a small Taylor–Green data set."""
     from cconv.data.generate import generate
     from cconv.scenes import scene_named
 
-    def make(folder):
-        scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=5, relaxation_steps=50)
-        generate(scene, folder, num_trajectories=4, num_frames=4, workers=1)
+    settings = {"particle_spacing": 0.1, "steps_per_frame": steps_per_frame, "relaxation_steps": 50}
+    scene = scene_named("taylor_green_2d", "small", **settings)
+    generate(scene, folder, num_trajectories=4, num_frames=num_frames, workers=1)
 
-    return made_once(tmp_path_factory, "flow", make)
+
+@pytest.fixture(scope="session")
+def flow_folder(tmp_path_factory):
+    """A small Taylor–Green data set."""
+    return made_once(tmp_path_factory, "flow", lambda folder: generate_vortices(folder, 5, 4))
 
 
 @pytest.fixture(scope="session")
 def steps_folder(tmp_path_factory):
     """A small Taylor–Green data set with frames enough for rollouts."""
-    from cconv.data.generate import generate
-    from cconv.scenes import scene_named
-
-    def make(folder):
-        scene = scene_named("taylor_green_2d", "small", particle_spacing=0.1, steps_per_frame=10, relaxation_steps=50)
-        generate(scene, folder, num_trajectories=4, num_frames=16, workers=1)
-
-    return made_once(tmp_path_factory, "steps", make)
+    return made_once(tmp_path_factory, "steps", lambda folder: generate_vortices(folder, 10, 16))
 
 
 @pytest.fixture(scope="session")

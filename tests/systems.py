@@ -96,6 +96,20 @@ def window_of(frame: Frame, generator: torch.Generator, history: int = 6, future
     )
 
 
+def still_window(walls: torch.Tensor, fluid: torch.Tensor) -> Window:
+    """Two equal frames of wall particles (S, D) and fluid (M, D)."""
+    present = torch.cat([walls, fluid])
+    return Window(
+        positions=torch.stack([present, present]),
+        future=torch.empty(0, *present.shape),
+        masses=torch.ones(len(present)),
+        particle_types=(torch.arange(len(present)) < len(walls)).long(),
+        boundary=None,
+        trajectory="0",
+        frame=1,
+    )
+
+
 def observed_and_sample(
     frame: Frame, scene: Scene, task: str, generator: torch.Generator
 ) -> tuple[Frame | Window, Sample]:

@@ -3,7 +3,7 @@
 import math
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,8 +17,9 @@ from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import Horizon, check_setting
 
 if TYPE_CHECKING:
+    from cconv.data.trajectory import Scene
     from cconv.evaluation.objectives import Objective
-    from cconv.models.model import Model
+    from cconv.models.model import Model, ModelConfig
 
 TRAINED_AT = (
     ("particle_spacing", "particle spacing", 1e-6),
@@ -84,18 +85,14 @@ def fit(
     (`cconv evaluate DIR`).
     """
     from cconv.models.checkpoint import save_model
-    from cconv.models.closed_form import solve_closed_form
     from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
-    from cconv.training.losses import LOSSES
 
     check_setting(Ridge, ridge, "--ridge")
     config, problem, dataset = _study_and_problem(study, data, settings, out)
     model = problem.build_model(config.configuration, config.seeds.init)
-    training = config.training
-    examples = problem.examples(training, config.seeds.data)
-    samples = (examples.draw(index, 0, model) for index in show_progress(range(len(examples)), "fit"))
-    solve_closed_form(model, samples, ridge, weight=LOSSES[training.loss])
+    places = show_progress(range(len(problem.train_samples)), "fit")
+    problem.solve_closed_form(model, config.training, places, ridge, config.seeds.data)
     error = problem.objective.error(model, show_progress(problem.valid_samples, "validate"))
     card = {
         "stage": "closed_form",
@@ -169,10 +166,7 @@ def evaluate(
         "objective": objective.name,
         **_errors_by(objective, model, asked, training, show_progress(asked, f"evaluate {split}")),
         "num_parameters": model.num_parameters,
-        "particle_spacing": dataset.scene.particle_spacing,
-        "trained_at_particle_spacing": model.config.particle_spacing,
-        "frame_dt": dataset.scene.frame_dt,
-        "trained_at_frame_dt": model.config.frame_dt,
+        **scale_facts(dataset.scene, model.config),
     }
     if not math.isfinite(facts[objective.name]):
         raise ConfigError(f"{checkpoint}: its predictions on the {split} split are not finite; train the model again.")
@@ -225,12 +219,28 @@ def _print_evaluation(facts: Mapping, objective: "Objective") -> None:
         lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
     if mean is not None:
         lines.append(f"Predicting the mean of the training split here: {mean:.4g}")
+    for what, found, trained in other_scales(facts):
+        lines.append(f"{what.capitalize()} {found:g}; the model was trained at {trained:g}")
+    for line in lines:
+        results.print(line, soft_wrap=True)
+
+
+def other_scales(facts: Mapping) -> Iterator[tuple[str, float, float]]:
+    """Yield each scale of the data that differs from the training data's: its name, and both values.
+
+    Args:
+        facts: Each scale of `TRAINED_AT`, of the data and, as "trained_at_...", of the model, None if it is not known.
+    """
     for name, what, tolerance in TRAINED_AT:
         found, trained = facts[name], facts[f"trained_at_{name}"]
         if trained is not None and not math.isclose(found, trained, rel_tol=tolerance):
-            lines.append(f"{what.capitalize()} {found:g}; the model was trained at {trained:g}")
-    for line in lines:
-        results.print(line, soft_wrap=True)
+            yield what, found, trained
+
+
+def scale_facts(scene: "Scene", config: "ModelConfig") -> dict[str, float | None]:
+    """Give the scales of data and of a model as `other_scales` compares them."""
+    found = {name: getattr(scene, name) for name, *_ in TRAINED_AT}
+    return found | {f"trained_at_{name}": getattr(config, name) for name, *_ in TRAINED_AT}
 
 
 def report(path: RunPath) -> None:

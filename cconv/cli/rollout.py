@@ -8,7 +8,7 @@ import typer
 
 from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
-from cconv.cli.model import TRAINED_AT
+from cconv.cli.model import other_scales, scale_facts
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError
 
@@ -132,15 +132,13 @@ def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
 
 
 def _warn_of_scales(scene: "Scene", config: "ModelConfig") -> None:
-    for name, what, tolerance in TRAINED_AT:
-        found, trained = getattr(scene, name), getattr(config, name)
-        if trained is not None and not math.isclose(found, trained, rel_tol=tolerance):
-            errors.print(
-                f"cconv: the data have a {what} of {found:g}, and the model was trained at {trained:g}; a step to the "
-                "next frame holds for the spacing and the time between frames that it was trained at.",
-                style="yellow",
-                soft_wrap=True,
-            )
+    for what, found, trained in other_scales(scale_facts(scene, config)):
+        errors.print(
+            f"cconv: the data have a {what} of {found:g}, and the model was trained at {trained:g}; a step to the "
+            "next frame holds for the spacing and the time between frames that it was trained at.",
+            style="yellow",
+            soft_wrap=True,
+        )
 
 
 def _check_free(out: Path) -> None:

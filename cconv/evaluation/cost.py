@@ -191,14 +191,15 @@ def measure_growth(
     Args:
         models: Checkpoint folder of each model.
         load: Reads a checkpoint folder.
-        analytic: Configuration of the field that is also summed analytically in turn with the models, named `ANALYTIC`.
+        analytic: Configuration of the field that is also summed analytically in turn with the models, named `ANALYTIC`;
+            nothing is summed for that of a step.
         sizes: Numbers of fluid particles, ascending.
         threads: Number of torch threads.
         repeats: Timed predictions of each model and size, at least 2.
         max_seconds: Largest median time of a frame after which a model is still timed at the next size.
     """
     callers = {name: partial(_block_call, load(path)) for name, path in models.items()}
-    if analytic is not None:
+    if analytic is not None and isinstance(analytic.asked, FieldTask):
         callers[ANALYTIC] = partial(_analytic_block_call, analytic)
     measured: dict[str, list[FrameTime]] = {name: [] for name in callers}
     with torch_threads(threads):

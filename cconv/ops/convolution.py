@@ -5,6 +5,7 @@ from torch import Tensor
 
 from cconv.ops import blocked, general
 from cconv.ops.filter_reads import FilterReads
+from cconv.ops.workers import runs_compiled
 
 
 def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
@@ -36,9 +37,4 @@ def columns(features: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
 
 
 def _is_fast(features: Tensor, reads: FilterReads) -> bool:
-    return (
-        features.device.type == "cpu"
-        and features.dtype in (torch.float32, torch.float64)
-        and not reads.requires_grad
-        and not torch.compiler.is_compiling()
-    )
+    return runs_compiled(features) and not reads.requires_grad

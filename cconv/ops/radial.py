@@ -12,7 +12,7 @@ from torch import Tensor
 from cconv.compiled import compile_cached
 from cconv.neighbors import Edges
 from cconv.ops.radial_gathers import place, point, scale
-from cconv.ops.workers import run_on_workers
+from cconv.ops.workers import run_on_workers, runs_compiled
 
 _compile = compile_cached(nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 
@@ -28,9 +28,7 @@ def applies(features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, ed
     return (
         not differentiated
         and max(scalar_filters.shape[2], vector_filters.shape[2]) <= MOST_OUTPUTS
-        and features.device.type == "cpu"
-        and features.dtype in (torch.float32, torch.float64)
-        and not torch.compiler.is_compiling()
+        and runs_compiled(features)
     )
 
 

@@ -24,6 +24,7 @@ from cconv.neighbors import Edges
 from cconv.ops import gathers, radial_gathers
 from cconv.ops.blocks import Sums, for_blocks
 from cconv.ops.products import linear
+from cconv.ops.workers import runs_compiled
 
 Kinds = tuple[int, int]  # numbers of scalars and of vectors
 Both = list[Tensor]  # matrices of scalars and of vectors
@@ -57,12 +58,8 @@ class WeightedEdges:
 def applies(features: Tensor, weighted: WeightedEdges) -> bool:
     """Tell whether `convolve` can be used: on the CPU, where positions are not differentiated."""
     positions = (weighted.edges.displacements, weighted.weights)
-    return (
-        not any(tensor is not None and tensor.requires_grad for tensor in positions)
-        and features.device.type == "cpu"
-        and features.dtype in (torch.float32, torch.float64)
-        and not torch.compiler.is_compiling()
-    )
+    moved = any(tensor is not None and tensor.requires_grad for tensor in positions)
+    return not moved and runs_compiled(features)
 
 
 def convolve(

@@ -16,6 +16,15 @@ from typing import Any
 import torch
 
 
+def runs_compiled(values: torch.Tensor) -> bool:
+    """Tell whether compiled loops take a tensor: they know the CPU and two precisions, and no graph can hold them."""
+    return (
+        values.device.type == "cpu"
+        and values.dtype in (torch.float32, torch.float64)
+        and not torch.compiler.is_compiling()
+    )
+
+
 def run_on_workers(work: Callable[[int], None], workers: int) -> None:
     """Call ``work(worker)`` for each worker from 0, each in a thread of its own; a single one runs in this thread.
 

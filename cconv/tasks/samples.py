@@ -129,28 +129,25 @@ def learned_samples(dataset: Dataset, split: str, task: StepTask, further: int =
     return WindowSamples(Windows(dataset.trajectories(split), task.history, 1, further=further), dataset.scene, task)
 
 
-def window_samples(dataset: Dataset, split: str, task: StepTask, future: int, stride: int) -> WindowSamples:
-    """Samples of the windows of a split, in order.
+def rolled_samples(dataset: Dataset, split: str, task: StepTask, horizon: int) -> WindowSamples:
+    """Samples of the windows that rollouts of a split begin with; these do not overlap, as in LagrangeBench.
 
     Args:
         dataset: Data set.
         split: "train", "valid" or "test".
         task: What is asked.
-        future: Frames after each window that are known.
-        stride: Frames from one window to the next.
+        horizon: Frames of each rollout, which are known after each window.
 
     Raises:
-        DataError: If a trajectory is too short for a single window.
+        DataError: If a trajectory is too short for a single one.
     """
     check_choice("split", split, dataset.splits)
-    windows = Windows(dataset.trajectories(split), task.history, future, stride)
+    windows = Windows(dataset.trajectories(split), task.history, horizon, stride=task.history + horizon)
     return WindowSamples(windows, dataset.scene, task)
 
 
 def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HORIZON) -> Iterable[Sample]:
     """Samples of a split that models are compared by: all frames of a field, or windows that rollouts begin with.
-
-    Windows do not overlap, as in LagrangeBench.
 
     Args:
         dataset: Data set.
@@ -159,7 +156,7 @@ def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HO
         horizon: Frames of each rollout of a step task.
     """
     if isinstance(task, StepTask):
-        return window_samples(dataset, split, task, horizon, stride=task.history + horizon)
+        return rolled_samples(dataset, split, task, horizon)
     return iterate_samples(dataset, split, as_field(task))
 
 

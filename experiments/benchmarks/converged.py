@@ -66,7 +66,7 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
     for _ in track(entries, f"{model}, seed {seed}", total=updates // training.evaluate_every):
         pass
     best = load_model(folder.checkpoint)
-    samples = {"valid": problem.valid_samples, "test": list(study_samples(study, dataset, "test"))}
+    samples = {"valid": problem.valid_samples, "test": study_samples(study, dataset, "test")}
     objective = problem.objective
     errors = {split: objective.error(best, each) for split, each in samples.items()}
     mean = {split: objective.of_mean_predictor(each, problem.train_samples) for split, each in samples.items()}

@@ -58,9 +58,8 @@ class Replay:
         return (step - window.last_displacements(scene.box))[window.is_fluid]
 
 
-def checked(task, path, types, scene, fault=None):
-    """Findings of all checks of the task by (check, label), for a replay with a fault."""
-    task = task_named(task, history=3)
+def material_of(task, path, types, scene):
+    """Rollouts from the beginning of a path, of which the first half is stored."""
     stored = Trajectory(
         name="0",
         first_frame=0,
@@ -70,7 +69,13 @@ def checked(task, path, types, scene, fault=None):
         particle_types=types,
         boundary=None,
     )
-    material = make_rollout_material([stored], scene, task)
+    return make_rollout_material([stored], scene, task)
+
+
+def checked(task, path, types, scene, fault=None):
+    """Findings of all checks of the task by (check, label), for a replay with a fault."""
+    task = task_named(task, history=3)
+    material = material_of(task, path, types, scene)
     model = Replay(task, path) if fault is None else Replay(task, path, fault)
     return {
         (name, finding.label): finding for name in task.checks for finding in CHECKS[name](material).findings(model)
@@ -178,16 +183,7 @@ def test_a_rollout_that_comes_to_its_stored_length_alone_is_told_apart(task):
 def test_the_verdict_names_what_failed_and_when(task):
     path = vortices()
     asked = task_named(task, history=3)
-    stored = Trajectory(
-        name="0",
-        first_frame=0,
-        positions=path[: FRAMES + 2].float(),
-        velocities=torch.zeros_like(path[: FRAMES + 2]),
-        masses=torch.full((SIDE**2,), DX**2),
-        particle_types=torch.zeros(SIDE**2, dtype=torch.int64),
-        boundary=None,
-    )
-    material = make_rollout_material([stored], SCENE, asked)
+    material = material_of(asked, path, torch.zeros(SIDE**2, dtype=torch.int64), SCENE)
     checks = [CHECKS[name](material) for name in asked.checks]
     found = measure_stability({"it": Replay(asked, path, heats)}, checks, material.counts)
     assert not found["stable"]

@@ -5,11 +5,12 @@ from itertools import islice
 
 import pytest
 import torch
+from systems import still_window
 
 from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
 from cconv.data.restart import restart, solved_frames
-from cconv.data.window import Window, window_at
+from cconv.data.window import window_at
 from cconv.errors import DataError, ShapeError, SimulationError
 from cconv.evaluation.rollout_metrics import squared_errors
 from cconv.scenes import SCENES, scene_named
@@ -97,17 +98,7 @@ def dam_break():
     right = walls[:, 0] > walls[:, 0].max() - 0.5 * scene.particle_spacing
     walls[right, 0] += 0.3 * scene.particle_spacing
     fluid, _ = scene.fluid(torch.Generator().manual_seed(0))
-    present = torch.cat([walls, fluid]).float()
-    start = Window(
-        positions=torch.stack([present, present]),
-        future=torch.empty(0, *present.shape),
-        masses=torch.ones(len(present)),
-        particle_types=(torch.arange(len(present)) < len(walls)).long(),
-        boundary=None,
-        trajectory="0",
-        frame=1,
-    )
-    return scene, start
+    return scene, still_window(walls.float(), fluid.float())
 
 
 def test_layers_that_are_not_stored_follow_those_that_are():

@@ -4,8 +4,8 @@ import statistics
 
 import pytest
 import torch
+from systems import still_window
 
-from cconv.data.window import Window
 from cconv.evaluation import solver_cost
 from cconv.evaluation.solver_cost import measure_solver
 from cconv.scenes import scene_named
@@ -16,17 +16,7 @@ def still(name):
     scene = scene_named(name, "small", relaxation_steps=5, steps_per_frame=3)
     fluid, _ = scene.fluid(torch.Generator().manual_seed(0))
     walls = scene.walls.positions[scene.walls.stored]
-    present = torch.cat([walls, fluid])
-    window = Window(
-        positions=torch.stack([present, present]),
-        future=torch.empty(0, *present.shape),
-        masses=torch.ones(len(present)),
-        particle_types=(torch.arange(len(present)) < len(walls)).long(),
-        boundary=None,
-        trajectory="0",
-        frame=1,
-    )
-    return scene, window
+    return scene, still_window(walls, fluid)
 
 
 @pytest.mark.parametrize("name", ["taylor_green_2d", "dam_break_2d"])

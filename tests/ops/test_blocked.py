@@ -67,13 +67,6 @@ def test_agrees_between_two_sets_of_points(channels, interpolation, generator):
             torch.testing.assert_close(ours, reference, atol=1e-12, rtol=1e-12)
 
 
-@pytest.fixture
-def restored_threads():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 def test_agrees_however_the_work_is_cut(generator, monkeypatch, restored_threads):
     reads = reads_of(generator, 3, "linear", num_points=200)
     expected = {}

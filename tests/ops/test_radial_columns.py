@@ -148,13 +148,6 @@ def test_derivatives_are_those_of_small_differences(message, generator):
     assert torch.autograd.gradgradcheck(lambda *given: fast(layer, geometry, *given), inputs)
 
 
-@pytest.fixture
-def restored_threads():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 def test_agrees_however_the_work_is_cut(generator, monkeypatch, restored_threads):
     layer, geometry = layer_of(generator, CHANNELS[4], 2, message="mixed"), geometry_of(generator, 2, points=300)
     assert geometry.edges.row_splits.diff().max() > radial_gathers.EDGES_AT_A_TIME

@@ -10,8 +10,9 @@ from torch import Tensor
 from cconv.data.splits import evenly_spaced
 from cconv.data.trajectory import Frame, Scene, Trajectory
 from cconv.errors import DataError
-from cconv.evaluation.checks.predictor import Predictor
+from cconv.evaluation.checks.predictor import ModelPredictor, Predictor
 from cconv.evaluation.checks.states import AS_IT_IS, State, stressed_states
+from cconv.models.model import Model
 from cconv.tasks.features import FluidState
 from cconv.tasks.task import FieldTask
 
@@ -70,6 +71,10 @@ class Material:
     typical: float
     fastest: float
     reach: float
+
+    def predictor(self, model: Model) -> ModelPredictor:
+        """Return what checks test of a model."""
+        return ModelPredictor(model)
 
     @property
     def counts(self) -> dict[str, int]:

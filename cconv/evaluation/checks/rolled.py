@@ -13,6 +13,7 @@ from cconv.data.splits import evenly_spaced
 from cconv.data.trajectory import Scene, Trajectory
 from cconv.data.window import Window, window_at
 from cconv.evaluation.checks.check import Check, Finding
+from cconv.models.model import Model
 from cconv.rollout.rollout import Diverged, StepModel, rollout
 from cconv.tasks.task import StepTask
 
@@ -34,11 +35,6 @@ class Rolled:
     positions: Tensor
     ended: str | None
 
-    @property
-    def stored(self) -> Tensor:
-        """The present of the start and the stored frames after it, (1 + F, N, D)."""
-        return torch.cat([self.start.present[None], self.start.future])
-
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutMaterial:
@@ -54,6 +50,10 @@ class RolloutMaterial:
     scene: Scene
     starts: tuple[Window, ...]
     _last: dict[int, tuple[StepModel, tuple[Rolled, ...]]] = field(default_factory=dict)
+
+    def predictor(self, model: Model) -> Model:
+        """Return what checks test of a model: the model itself, which they roll out."""
+        return model
 
     @property
     def counts(self) -> dict[str, int]:

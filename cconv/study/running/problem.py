@@ -13,16 +13,20 @@ from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
+from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
 from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TaskConfig, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
-from cconv.tasks.samples import HORIZON, Sample, WindowSamples, compared_samples, learned_samples
-from cconv.tasks.task import StepTask, Task
+from cconv.tasks.samples import HORIZON, Sample, WindowSamples, iterate_samples, learned_samples, rolled_samples
+from cconv.tasks.task import StepTask, Task, as_field
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
+from cconv.training.losses import LOSSES
 from cconv.training.unroll import Pushforward
 from cconv.validation import PathText, check_setting, validated
+
+Progress = Callable[[Iterable, str], Iterable]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,17 @@ class Problem:
         begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
         pushforward = Pushforward(training.pushforward, begins)
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)
+
+    def solve_closed_form(
+        self, model: Model, training: TrainingConfig, places: Iterable[int], ridge: float, seed: int
+    ) -> None:
+        """Fit a model of a single layer to the examples at some places, as `cconv.models.closed_form` does.
+
+        With noise, each place gives one noisy example; the loss says how much each frame counts.
+        """
+        examples = self.examples(training, seed)
+        drawn = (examples.draw(place, 0, model) for place in places)
+        solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
 
     @cached_property
     def present_features(self) -> tuple[str, ...]:
@@ -125,12 +140,28 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
     return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
 
 
-def study_samples(study: StudyConfig, dataset: Dataset, split: str) -> Iterable[Sample]:
-    """Make the samples of a split for the task of a study, of the training split those to learn from."""
+def study_samples(
+    study: StudyConfig, dataset: Dataset, split: str, progress: Progress = lambda items, _: items
+) -> Sequence[Sample]:
+    """Make the samples of a split for the task of a study, of the training split those to learn from.
+
+    Args:
+        study: The study.
+        dataset: Its data.
+        split: "train", "valid" or "test".
+        progress: Wraps an iterable to show progress, given a label.
+    """
     task = study_task(study.task, dataset.scene)
-    if isinstance(task, StepTask) and split == "train":
+    if not isinstance(task, StepTask):
+        return list(progress(iterate_samples(dataset, split, as_field(task)), split))
+    if split == "train":
         return learned_samples(dataset, split, task, further=MOST_PUSHED)
-    return compared_samples(dataset, split, task, study.task.horizon or HORIZON)
+    return rolled_samples(dataset, split, task, _horizon(study))
+
+
+def _horizon(study: StudyConfig) -> int:
+    """Frames of the rollouts that a study compares models of a step by."""
+    return study.task.horizon or HORIZON
 
 
 def check_test_split(study: StudyConfig, dataset: Dataset) -> None:
@@ -142,8 +173,7 @@ def check_test_split(study: StudyConfig, dataset: Dataset) -> None:
     task = study_task(study.task, dataset.scene)
     if isinstance(task, StepTask):
         for block in dataset.splits["test"]:
-            horizon = study.task.horizon or HORIZON
-            check_length(block.trajectory, dataset.num_frames(block), task.history, horizon)
+            check_length(block.trajectory, dataset.num_frames(block), task.history, _horizon(study))
 
 
 def study_task(task: TaskConfig, scene: Scene) -> Task:
@@ -153,9 +183,7 @@ def study_task(task: TaskConfig, scene: Scene) -> Task:
     return task_named(task.name, task.kernel, relative, task.history)
 
 
-def load_problem(
-    study: StudyConfig, dataset: Dataset, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
-) -> Problem:
+def load_problem(study: StudyConfig, dataset: Dataset, progress: Progress = lambda items, _: items) -> Problem:
     """Load the training and validation samples of a study; the test split is not read.
 
     Args:
@@ -163,12 +191,12 @@ def load_problem(
         dataset: Its data.
         progress: Wraps an iterable to show progress, given a label.
     """
-    train, valid = (study_samples(study, dataset, split) for split in ("train", "valid"))
+    train, valid = (study_samples(study, dataset, split, progress) for split in ("train", "valid"))
     return Problem(
         scene=dataset.scene,
         task=study_task(study.task, dataset.scene),
-        train_samples=train if isinstance(train, WindowSamples) else list(progress(train, "train")),
-        valid_samples=valid if isinstance(valid, WindowSamples) else list(progress(valid, "valid")),
+        train_samples=train,
+        valid_samples=valid,
     )
 
 

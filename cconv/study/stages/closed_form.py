@@ -20,7 +20,6 @@ from pydantic import Field
 from cconv.data.splits import evenly_spaced
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import save_model
-from cconv.models.closed_form import solve_closed_form
 from cconv.networks import ARCHITECTURES
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import (
@@ -41,7 +40,6 @@ from cconv.study.running.trial import Trial, describe
 from cconv.study.stages.jobs import trial_name
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample
-from cconv.training.losses import LOSSES
 from cconv.validation import Value, Whole
 
 MOST_LAYERS = 50_000  # listed at most; a space may hold any number of single layers
@@ -243,7 +241,7 @@ def _fit_and_record(
 ) -> None:
     """Fit a layer to the training samples at some places, and record its error on others.
 
-    No weight depends on the seed. With noise, each place gives one noisy sample.
+    No weight depends on the seed.
     """
     folder.check_begun_with(parameters)
     if folder.ended:
@@ -257,11 +255,9 @@ def _fit_and_record(
     config = describe(problem, trial, model, untrained) | {"closed_form": True, "ridge": ridge}
     folder.start(config)
     places, valid = samples
-    examples = problem.examples(configuration.training, study.seeds.data)
     start = time.perf_counter()
     try:
-        drawn = (examples.draw(place, 0, model) for place in places)
-        solve_closed_form(model, drawn, ridge, weight=LOSSES[configuration.training.loss])
+        problem.solve_closed_form(model, configuration.training, places, ridge, study.seeds.data)
     except ConfigError as error:
         folder.finish("failed", str(error))
         return

@@ -11,10 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
-from cconv.evaluation.checks import make_checks
-from cconv.evaluation.checks.material import Material, make_material
-from cconv.evaluation.checks.predictor import ModelPredictor
-from cconv.evaluation.checks.rolled import RolloutMaterial, make_rollout_material
+from cconv.evaluation.checks import make_checks, material_for
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
@@ -57,7 +54,7 @@ from cconv.study.stages.finalists import (
 )
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample, WindowSamples
-from cconv.tasks.task import FieldTask, StepTask, as_field
+from cconv.tasks.task import FieldTask
 
 TIMED_FRAMES = 5
 GROWTH_REPEATS = 3
@@ -91,7 +88,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
     check_any_finished(run, finalists, failed)
     judged = _judge(session, finalists)
     growth = _growth(session, finalists)
-    samples = _test_samples(session)
+    samples = study_samples(study, session.dataset, "test", session.progress)
     tests, test_errors = _errors(session, finalists, samples, "test errors")
     is_field = isinstance(session.problem.task, FieldTask)
     explained = [each for each in finalists if is_field and each.id in (BASELINE, judged.chosen.id)]
@@ -124,11 +121,6 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
         wall_seconds=_seconds_before(session, stage) + time.perf_counter() - start,
         **earlier.found(),
     )
-
-
-def _test_samples(session: Session) -> Sequence[Sample]:
-    samples = study_samples(session.study, session.dataset, "test")
-    return samples if isinstance(samples, WindowSamples) else list(session.progress(samples, "test"))
 
 
 def _complete_cards(run: RunFolder, finalists: Sequence[Retrained], tests: Mapping[str, Errors]) -> None:
@@ -257,9 +249,7 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
     grown = measure_growth(
         checkpoints,
         load_model,
-        analytic=None
-        if isinstance(session.problem.task, StepTask)
-        else load_model(finalists[0].best_checkpoint).config,
+        analytic=load_model(finalists[0].best_checkpoint).config,
         sizes=sizes,
         threads=settings.threads,
         repeats=GROWTH_REPEATS,
@@ -282,16 +272,11 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
     """
     problem, scene = session.problem, session.dataset.scene
     trajectories = list(session.dataset.trajectories("valid"))
-    material: Material | RolloutMaterial
-    predictor: Callable[[Model], Any]
-    if isinstance(problem.task, StepTask):
-        material, predictor = make_rollout_material(trajectories, scene, problem.task), lambda model: model
-    else:
-        reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-        material, predictor = make_material(trajectories, scene, as_field(problem.task), reach), ModelPredictor
+    reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
+    material = material_for(problem.task, trajectories, scene, reach)
     checks = make_checks(material)
     found = {
-        finalist.id: Stability(**measure_stability(_of_seeds(finalist, predictor), checks, material.counts))
+        finalist.id: Stability(**measure_stability(_of_seeds(finalist, material.predictor), checks, material.counts))
         for finalist in session.progress(finalists, "stability")
     }
     return {check.name: check.description() for check in checks}, found
