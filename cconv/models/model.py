@@ -198,8 +198,11 @@ class Model(nn.Module):
     @torch.no_grad()
     def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_answers} C"]:
         """Prediction (M, C) in the units of the data that the inputs were made of."""
-        field = self(inputs, self.geometry(inputs)) * self.target_scale + self.target_mean
-        return field * self.task.unit(inputs.units)
+        return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
+
+    def in_units_of_data(self, prediction: Float[Tensor, "M C"], inputs: Inputs) -> Float[Tensor, "M C"]:
+        """Convert a standardised prediction (M, C) to the units of the data that the inputs were made of."""
+        return (prediction * self.target_scale + self.target_mean) * self.task.unit(inputs.units)
 
     def predict_frame(self, frame: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
         """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data.

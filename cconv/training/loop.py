@@ -11,11 +11,13 @@ import torch
 from cconv.errors import check_choice
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
+from cconv.training.averages import begin_average, update_average
 from cconv.training.batches import batches
 from cconv.training.examples import Examples
 from cconv.training.geometry_cache import GeometryCache
 from cconv.training.losses import LOSSES, loss_of
 from cconv.training.progress import Progress, begin
+from cconv.training.unroll import unrolled
 
 SCHEDULES = {
     "constant": lambda progress: 1.0,
@@ -35,6 +37,9 @@ class Optimization:
         learning_rate: Initial learning rate of Adam.
         schedule: "constant", "cosine" or "exponential"; the last two fall to 1 % of the initial rate.
         loss: Name in `LOSSES`.
+        unroll: Steps of the model's own rollout that an update differentiates through; 1 for fields.
+        unroll_from: Share of the updates after which there is more than one.
+        average: Decay of the moving average of the weights that is evaluated; 0 evaluates the weights themselves.
     """
 
     updates: int
@@ -43,10 +48,17 @@ class Optimization:
     learning_rate: float = 1e-3
     schedule: str = "cosine"
     loss: str = "mse"
+    unroll: int = 1
+    unroll_from: float = 0.5
+    average: float = 0.0
 
     def rate_at(self, update: int) -> float:
         """Return the learning rate of an update, counted from 1."""
         return self.learning_rate * SCHEDULES[self.schedule]((update - 1) / self.updates)
+
+    def steps_at(self, update: int) -> int:
+        """Return the number of steps in an update, counted from 1."""
+        return self.unroll if update > self.unroll_from * self.updates else 1
 
     def is_evaluated(self, update: int) -> bool:
         """Tell whether an evaluation follows an update."""
@@ -64,6 +76,7 @@ class TrainingState:
         valid_error: Validation error if an evaluation followed this update, else None.
         seconds: Time since training began, evaluations included.
         diverged: Whether a loss or validation error was not finite, which ends the training.
+        model: The model as it is evaluated: with the weights of this update, or with their average.
     """
 
     updates: int
@@ -72,6 +85,7 @@ class TrainingState:
     valid_error: float | None
     seconds: float
     diverged: bool
+    model: Model
 
 
 def train(
@@ -102,6 +116,9 @@ def train(
     check_choice("schedule", optimization.schedule, SCHEDULES)
     check_choice("loss", optimization.loss, LOSSES)
     progress = progress or begin(model)
+    if optimization.average > 0 and progress.average is None:
+        progress.average = begin_average(model)
+    judged = progress.average or model
     start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
     order = batches(len(examples), optimization.batch_size, data_seed)
@@ -110,10 +127,12 @@ def train(
         rate = optimization.rate_at(update)
         progress.optimizer.param_groups[0]["lr"] = rate
         batch = [examples.draw(index, update, model) for index in indices]
-        loss = _update(model, batch, progress.optimizer, geometry, optimization.loss)
+        loss = _update(model, batch, progress.optimizer, geometry, optimization.loss, optimization.steps_at(update))
+        if progress.average is not None:
+            update_average(progress.average, model, optimization.average, update)
         valid = None
         if math.isfinite(loss) and optimization.is_evaluated(update):
-            valid = valid_error(model, geometry)
+            valid = valid_error(judged, geometry)
         diverged = not math.isfinite(loss) or (valid is not None and not math.isfinite(valid))
         progress.updates, progress.seconds = update, time.perf_counter() - start
         yield TrainingState(
@@ -123,21 +142,26 @@ def train(
             valid_error=valid,
             seconds=progress.seconds,
             diverged=diverged,
+            model=judged,
         )
         if diverged:
             return
 
 
 def _update(
-    model: Model, batch: Sequence[Sample], optimizer: torch.optim.Optimizer, geometry: GeometryCache, loss_name: str
+    model: Model,
+    batch: Sequence[Sample],
+    optimizer: torch.optim.Optimizer,
+    geometry: GeometryCache,
+    loss_name: str,
+    steps: int,
 ) -> float:
     """Take one step on the mean loss of a batch, frame by frame, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     total = 0.0
     for sample in batch:
-        prediction = model(sample.inputs, geometry(sample))
-        target = model.standardize_target(sample.target)
-        loss = loss_of(prediction, target, LOSSES[loss_name]) / len(batch)
+        losses = [loss_of(*each, LOSSES[loss_name]) for each in unrolled(model, sample, steps, geometry)]
+        loss = torch.stack(losses).mean() / len(batch)
         loss.backward()
         total += loss.item()
     if math.isfinite(total):

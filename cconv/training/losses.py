@@ -22,7 +22,7 @@ def balanced(target: Float[Tensor, "M C"]) -> float:
     Frames of a flow that has decayed then still matter beside the fast ones at its start: with equal weights, a model
     that was trained on decaying flows leaves their late frames, in which its own noise is larger than the motion.
     """
-    return 1.0 / max(SMALLEST, float(target.square().mean().sqrt()))
+    return 1.0 / max(SMALLEST, float(target.detach().square().mean().sqrt()))
 
 
 LOSSES: dict[str, FrameWeight] = {"mse": equal, "balanced_mse": balanced}

@@ -8,10 +8,12 @@ import torch
 from pydantic import Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from cconv.errors import DataError
 from cconv.files import parse_json, replacing
 from cconv.models.model import Model
+from cconv.training.averages import begin_average
 from cconv.validation import Real, StrictModel, Whole
 
 
@@ -28,11 +30,13 @@ class Progress:
         optimizer: Adam over the model's parameters.
         updates: Gradient updates done.
         seconds: Time spent on them, evaluations included.
+        average: The model with averages of its weights; None without them.
     """
 
     optimizer: torch.optim.Adam
     updates: int = 0
     seconds: float = 0.0
+    average: Model | None = None
 
 
 def begin(model: Model) -> Progress:
@@ -41,12 +45,14 @@ def begin(model: Model) -> Progress:
 
 
 def save_progress(path: Path, model: Model, progress: Progress) -> None:
-    """Write weights, Adam's moments and counts to one safetensors file, atomically."""
+    """Write weights, their averages, Adam's moments and counts to one safetensors file, atomically."""
     counts = {"updates": progress.updates, "seconds": progress.seconds}
     tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
     for name, parameter in model.named_parameters():
         moments = progress.optimizer.state.get(parameter, {})
         tensors |= {f"adam.{key}.{name}": value for key, value in moments.items()}
+    averages = {} if progress.average is None else progress.average.state_dict()
+    tensors |= {f"average.{name}": value for name, value in averages.items()}
     with replacing(path) as part:
         save_file({name: value.contiguous() for name, value in tensors.items()}, part, {"counts": json.dumps(counts)})
 
@@ -62,9 +68,10 @@ def load_progress(path: Path, model: Model) -> Progress:
         with safe_open(path, framework="pt") as file:
             counts = _Counts.model_validate(parse_json((file.metadata() or {})["counts"]))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
-        prefix = "weights."
-        weights = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        model.load_state_dict(weights)
+        model.load_state_dict(_below("weights.", tensors))
+        if averages := _below("average.", tensors):
+            progress.average = begin_average(model)
+            progress.average.load_state_dict(averages)
         for name, parameter in model.named_parameters():
             if f"adam.step.{name}" in tensors:  # a parameter that no loss depends on has no moments
                 moments = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
@@ -76,3 +83,8 @@ def load_progress(path: Path, model: Model) -> Progress:
         raise DataError(f"{path}: no progress of this training ({reason}); delete it to begin again.") from error
     progress.updates, progress.seconds = counts.updates, counts.seconds
     return progress
+
+
+def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -1,13 +1,17 @@
 """Unrolling: a model learns from states that its own rollout leads to."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import torch
+from torch import Tensor
 
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
-from cconv.rollout.rollout import Diverged, StepModel, rollout
+from cconv.models.model import FrameGeometry, Model
+from cconv.rollout.rollout import Diverged, StepModel, check_state, rollout
+from cconv.tasks.samples import Sample, StepSample, make_step_sample
 
 
 @dataclass(frozen=True)
@@ -39,3 +43,44 @@ def pushed(model: StepModel, window: Window, scene: Scene, steps: int) -> Window
     except Diverged:
         pass
     return window
+
+
+def unrolled(
+    model: Model, sample: Sample, steps: int, geometry: Callable[[Sample], FrameGeometry]
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield standardised prediction and target (M, C) of consecutive steps of the model's own rollout from a sample.
+
+    Gradients flow back through the steps, by way of the positions: the target of a later step is what would lead to the
+    stored frame from where the model has come, so that its error is that of the rollout's positions. The rollout ends
+    early where it diverges, or where no frame is stored to compare with. Source: Ummenhofer et al., "Lagrangian Fluid
+    Simulation with Continuous Convolutions" (ICLR 2020), whose loss has two steps.
+
+    Args:
+        model: The model.
+        sample: Where the rollout begins; of a step task if there is more than one step.
+        steps: Number of steps.
+        geometry: Function from a sample to its geometry, e.g. a cache.
+    """
+    prediction = model(sample.inputs, geometry(sample))
+    yield prediction, model.standardize_target(sample.target)
+    for _ in range(steps - 1):
+        following = _followed(model, sample, prediction)
+        if following is None:
+            return
+        sample = following
+        prediction = model(sample.inputs, model.geometry(sample.inputs))
+        yield prediction, model.standardize_target(sample.target)
+
+
+def _followed(model: Model, sample: Sample, prediction: Tensor) -> StepSample | None:
+    """The sample that a standardised prediction leads to; None if there is none."""
+    if not isinstance(sample, StepSample) or len(sample.window.future) < 2:
+        return None
+    answer = model.in_units_of_data(prediction, sample.inputs)
+    window = replace(sample.window, positions=sample.window.positions.double())
+    window = sample.task.integrator.advance(window, answer, sample.scene)
+    try:
+        check_state(replace(window, positions=window.positions.detach()), sample.scene)
+    except Diverged:
+        return None
+    return make_step_sample(window, sample.scene, sample.task)

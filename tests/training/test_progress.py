@@ -13,7 +13,7 @@ from cconv.training.loop import Optimization, train
 from cconv.training.progress import begin, load_progress, save_progress
 
 NETWORKS = [configured(layers=2, kernel_size=3), configured(layers=2, architecture="radial_net", radial_terms=4)]
-ASKED = Optimization(updates=12, evaluate_every=3, learning_rate=0.01, batch_size=2)
+ASKED = Optimization(updates=12, evaluate_every=3, learning_rate=0.01, batch_size=2, average=0.8)
 
 
 @pytest.fixture
@@ -31,7 +31,8 @@ def one_thread():
 def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, network, left_at):
     given = problem(generator)
     whole = given.build_model(network, 0)
-    losses = [state.train_loss for state in train(whole, StoredExamples(given.train_samples), given.valid_error, ASKED)]
+    *_, judged = states = list(train(whole, StoredExamples(given.train_samples), given.valid_error, ASKED))
+    losses = [(state.train_loss, state.valid_error) for state in states]
     first = given.build_model(network, 0)
     progress = begin(first)
     states = train(first, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=progress)
@@ -42,8 +43,14 @@ def test_losses_and_weights_are_the_same_to_the_last_bit(generator, tmp_path, ne
     second = given.build_model(network, 1)
     restored = load_progress(tmp_path / "progress", second)
     rest = list(train(second, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=restored))
-    assert [state.train_loss for state in rest] == losses[left_at:]
-    assert all(torch.equal(ours, theirs) for ours, theirs in zip(second.parameters(), whole.parameters(), strict=True))
+    assert [(state.train_loss, state.valid_error) for state in rest] == losses[left_at:]
+    assert same(second, whole)
+    assert same(rest[-1].model, judged.model)
+    assert not same(judged.model, whole)
+
+
+def same(ours, theirs):
+    return all(torch.equal(*pair) for pair in zip(ours.parameters(), theirs.parameters(), strict=True))
 
 
 def test_a_restored_training_counts_its_seconds_from_where_it_was(generator, monkeypatch):

@@ -9,7 +9,7 @@ from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples
-from cconv.training.unroll import Pushforward, pushed
+from cconv.training.unroll import Pushforward, pushed, unrolled
 
 TASK, SCENE = task_named("acceleration"), periodic_scene()
 
@@ -56,3 +56,49 @@ def test_examples_are_never_pushed_beyond_what_is_stored(samples, model):
     examples = AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(20, 0), seed=0)
     frames = {examples.draw(0, update, model).frame for update in range(1, 40)}
     assert frames == {5, 6, 7, 8}  # at least one frame of future is left to lead to
+
+
+@pytest.fixture
+def equivariant(samples, generator):
+    """A model whose targets have one scale along all axes."""
+    return model_of(configured(architecture="radial_net", layers=2), SCENE, "acceleration", list(samples), generator)
+
+
+def errors_of(model, sample, steps):
+    """Root of the mean squared error of each step, in the units of the data."""
+    pairs = unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))
+    unit = model.target_scale[0] * sample.target_unit
+    return [float((prediction - target).detach().square().mean().sqrt() * unit) for prediction, target in pairs]
+
+
+def test_errors_of_unrolled_steps_are_those_of_the_rollout(samples, equivariant):
+    """What a later step answers wrongly is how far the rollout is from the stored frame."""
+    start = samples.windows[0]
+    path = [window.present for window, _ in zip(rollout(equivariant, start, SCENE), range(3), strict=False)]
+    off = SCENE.box.displacement(torch.stack(path), start.future[:3].double())
+    expected = off.square().mean((1, 2)).sqrt().tolist()
+    assert errors_of(equivariant, samples[0], 3) == pytest.approx(expected, rel=1e-4)
+
+
+def test_gradients_of_unrolled_steps_are_those_of_finite_differences(samples, equivariant):
+    """The first step's part in the later error comes by way of positions, densities and neighbours' directions."""
+    model, sample = equivariant, samples[0]
+    weights = next(model.parameters())
+
+    def last_error():
+        *_, (prediction, target) = unrolled(model, sample, 3, lambda each: model.geometry(each.inputs))
+        return (prediction - target).square().mean()
+
+    (gradient,) = torch.autograd.grad(last_error(), weights)
+    direction, small = gradient.sign(), 1e-3
+    with torch.no_grad():
+        after, before = (last_error() for sign in (1, -2) if weights.add_(sign * small * direction) is not None)
+    assert float((after - before) / (2 * small)) == pytest.approx(float((gradient * direction).sum()), rel=1e-3)
+
+
+def test_unrolling_ends_where_nothing_is_stored_and_where_it_diverges(samples, model):
+    assert len(errors_of(model, samples[0], 9)) == 4
+    with torch.no_grad():
+        for weights in model.parameters():
+            weights.fill_(torch.nan)
+    assert len(errors_of(model, samples[0], 9)) == 1

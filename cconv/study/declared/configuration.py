@@ -16,7 +16,9 @@ from cconv.tasks.task import StepTask
 from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
+MOST_UNROLLED = 10  # steps that an update differentiates through, whose states are all kept in memory
 MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns from
+STILL = {"noise": 0.0, "pushforward": 0, "unroll": 1}  # settings of a training, with which no particle is moved
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
@@ -24,7 +26,8 @@ _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for nam
 HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
-    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "noise", "pushforward")),
+    *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
+    *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
 )
 
 Settings = TypeVar("Settings", bound=StrictModel)
@@ -87,7 +90,9 @@ class TrainingConfig(StrictModel):
     `loss` says how much each frame counts. `noise`, for step tasks, is the standard deviation of the random walk that
     is added to the velocities of a window, in particle spacings per frame. `pushforward` is the largest number of steps
     that the model's own rollout goes on before the step that it learns from, once a share `pushforward_from` of the
-    updates is done.
+    updates is done. `unroll` is the number of steps of that rollout that it then learns from at once, with gradients
+    through all of them, once a share `unroll_from` of the updates is done. `average` is the decay of a moving average
+    of the weights, which is evaluated and kept in their place; 0 keeps the weights themselves.
     """
 
     updates: Updates = 600
@@ -99,12 +104,15 @@ class TrainingConfig(StrictModel):
     noise: Real = Field(0.0, ge=0, le=1)
     pushforward: Whole = Field(0, ge=0, le=MOST_PUSHED)
     pushforward_from: Real = Field(0.5, ge=0, le=1)
+    unroll: Whole = Field(1, ge=1, le=MOST_UNROLLED)
+    unroll_from: Real = Field(0.5, ge=0, le=1)
+    average: Real = Field(0.0, ge=0, lt=1)
     cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
 
     @property
-    def moves_particles(self) -> bool:
-        """Whether windows are changed before a network learns from them, so that no geometry serves twice."""
-        return self.noise > 0 or self.pushforward > 0
+    def moving(self) -> dict[str, float]:
+        """Settings by name that move particles, so that no geometry serves twice; only steps have them."""
+        return {name: getattr(self, name) for name, still in STILL.items() if getattr(self, name) != still}
 
 
 class Configuration(NamedTuple):
@@ -168,10 +176,10 @@ def check_asked(configuration: Configuration, task: str) -> None:
     foreign = [name for name in configuration.features if name not in TASKS[task].features]
     if foreign:
         raise ConfigError(f"not possible ({feature_path(foreign[0])}: is no feature of the task {task!r})")
-    training = configuration.training
-    if training.moves_particles and not issubclass(TASKS[task], StepTask):
-        name, value = ("noise", training.noise) if training.noise else ("pushforward", training.pushforward)
-        raise ConfigError(f"not possible ({TRAINING}.{name}: must be 0 for the field {task!r}, got {value:g})")
+    for name, value in configuration.training.moving.items():
+        if not issubclass(TASKS[task], StepTask):
+            allowed = f"must be {STILL[name]:g} for the field {task!r}"
+            raise ConfigError(f"not possible ({TRAINING}.{name}: {allowed}, got {value:g})")
 
 
 def _possible(form: type[Settings], table: str, values: Mapping[str, Value]) -> Settings:

@@ -65,13 +65,11 @@ class Problem:
         Raises:
             ConfigError: If one of them is asked for where there are no windows.
         """
-        if not training.moves_particles:
+        if not training.moving:
             return StoredExamples(self.train_samples)
         if not isinstance(self.train_samples, WindowSamples):
-            raise ConfigError(
-                f"`training.noise` and `training.pushforward` must be 0 for the field {self.task.name!r}, got "
-                f"{training.noise:g} and {training.pushforward}."
-            )
+            settings = ", ".join(f"`training.{name}` = {value:g}" for name, value in training.moving.items())
+            raise ConfigError(f"{settings}: not possible for the field {self.task.name!r}, which has no windows.")
         begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
         pushforward = Pushforward(training.pushforward, begins)
         return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from cconv.evaluation.cost import flops_per_particle
@@ -69,9 +69,9 @@ def run_trial(
         model,
         problem.examples(training, trial.data_seed),
         problem.valid_error,
-        Optimization(**training.model_dump(exclude={"cache_megabytes", "noise", "pushforward", "pushforward_from"})),
+        Optimization(**training.model_dump(include={field.name for field in fields(Optimization)})),
         data_seed=trial.data_seed,
-        cache_bytes=0 if training.moves_particles else training.cache_megabytes * 2**20,
+        cache_bytes=0 if training.moving else training.cache_megabytes * 2**20,
         progress=progress,
     )
     try:
@@ -85,13 +85,13 @@ def run_trial(
             error = entry["valid_error"]
             if error is not None and error < best:
                 best = error
-                save_model(model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
+                save_model(state.model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
             folder.append(entry)
             save_progress(folder.progress, model, progress)
             yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
-            save_model(model, folder.checkpoint, card | {"valid_error": None})
+            save_model(progress.average or model, folder.checkpoint, card | {"valid_error": None})
         raise
 
 
