@@ -10,7 +10,7 @@ from cconv.sph.kernels import (
     WendlandC4,
     kernel_named,
 )
-from cconv.sph.operators import density, density_gradient, density_rate, interpolate
+from cconv.sph.operators import density, density_gradient, density_rate, interpolate, velocity_gradient
 from cconv.sph.solver import EquationOfState, ParticleState, Scheme, WeaklyCompressibleSPH
 
 __all__ = [
@@ -30,4 +30,5 @@ __all__ = [
     "density_rate",
     "interpolate",
     "kernel_named",
+    "velocity_gradient",
 ]

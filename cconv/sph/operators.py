@@ -1,4 +1,4 @@
-r"""SPH sums over neighbours: density D1, its rate D2, its gradient D3, and interpolation.
+r"""SPH sums over neighbours: density D1, its rate D2, its gradient D3, the gradient of velocities, and interpolation.
 
 Numbers are those of the thesis, section 2.2.1; i is ``edges.receivers``, j is ``edges.senders``, and
 :math:`\nabla_i W_{ij} = W'(r_{ij})\, r_{ij} / |r_{ij}|` with :math:`r_{ij} = x_i - x_j` = ``edges.displacements``.
@@ -96,6 +96,36 @@ def density_gradient(
     difference = densities[edges.senders] - densities[edges.receivers]
     terms = (masses[edges.senders] * difference)[:, None] * kernel_gradient(edges, kernel)
     return _sum_over_neighbours(terms, edges) / densities[:, None]
+
+
+def velocity_gradient(
+    volumes: Float[Tensor, " N"], velocities: Float[Tensor, "N D"], edges: Edges, kernel: AbstractKernel
+) -> Float[Tensor, "N D D"]:
+    r"""Gradient of the velocity, :math:`(\nabla v)_{ab} = \partial v_a / \partial x_b`.
+
+    .. math:: (\nabla v)_i = \sum_j V_j (v_j - v_i) \otimes \nabla_i W_{ij}
+
+    Rotations and shears of a regular arrangement are right to the accuracy of the sum over its kernel; a uniform motion
+    has none. Source: Monaghan, "Smoothed particle hydrodynamics" (Rep. Prog. Phys., 2005), section 2.2.
+
+    Args:
+        volumes: V = m/ρ (N,).
+        velocities: v (N, D), length/time.
+        edges: Pairs of the particles within at least the kernel's support.
+        kernel: W.
+
+    Returns:
+        (N, D, D), 1/time.
+
+    Raises:
+        ShapeError: If shapes do not fit the edges.
+        ConfigError: If the edges are bipartite, do not reach as far as the kernel, or differ from it in dimension.
+    """
+    check_one_set(edges)
+    particles = edges.num_senders
+    check_sum(edges, kernel, volumes=(volumes, (particles,)), velocities=(velocities, (particles, edges.dim)))
+    difference = volumes[edges.senders, None] * (velocities[edges.senders] - velocities[edges.receivers])
+    return _sum_over_neighbours(difference[:, :, None] * kernel_gradient(edges, kernel)[:, None, :], edges)
 
 
 def interpolate(

@@ -16,6 +16,7 @@ from cconv.sph import (
     density_rate,
     interpolate,
     kernel_named,
+    velocity_gradient,
 )
 
 SUPPORT = 0.45
@@ -262,6 +263,32 @@ def test_rigid_rotation_changes_no_density(name, dim, generator):
 
 @over_all_kernels
 @over_dims
+def test_the_trace_of_the_velocity_gradient_is_the_density_rate(name, dim, generator):
+    """By mass instead of volume, the divergence is the rate at which density falls, to rounding."""
+    kernel = make(name, dim)
+    positions, velocities, masses = random_fluid(dim, generator)
+    edges = radius_graph(positions, kernel.support_radius)
+    gradients = velocity_gradient(masses, velocities, edges, kernel)
+    rates = density_rate(masses, velocities, edges, kernel)
+    torch.testing.assert_close(-torch.einsum("nii->n", gradients), rates, atol=1e-10, rtol=1e-10)
+
+
+@over_all_kernels
+@over_resolutions
+def test_velocity_gradient_of_a_linear_velocity_is_its_deformation(name, dim, per_support, tolerance):
+    kernel = make(name, dim, 1.0)
+    positions, centre = filled_ball(dim, per_support)
+    volumes = torch.full((len(positions),), 1 / per_support**dim, dtype=torch.float64)
+    deformation = DEFORMATION[:dim, :dim]
+    edges = radius_graph(positions, kernel.support_radius)
+    gradients = velocity_gradient(volumes, positions @ deformation.T + 3, edges, kernel)
+    if name == "gaussian":
+        tolerance += GAUSSIAN_SHORTFALL[dim]
+    torch.testing.assert_close(gradients[centre], deformation, atol=tolerance * float(deformation.abs().max()), rtol=0)
+
+
+@over_all_kernels
+@over_dims
 def test_uniform_density_has_no_gradient(name, dim, generator):
     kernel = make(name, dim)
     positions, _, masses = random_fluid(dim, generator)
@@ -450,6 +477,7 @@ def every_operator(edges, kernel, particles=4, dim=2):
     yield lambda: density(masses, edges, kernel)
     yield lambda: density_rate(masses, velocities, edges, kernel)
     yield lambda: density_gradient(masses, masses, edges, kernel)
+    yield lambda: velocity_gradient(masses, velocities, edges, kernel)
 
 
 def test_edges_must_reach_as_far_as_the_kernel():
@@ -462,7 +490,7 @@ def test_edges_must_reach_as_far_as_the_kernel():
 def test_rounding_of_the_cutoff_is_forgiven():
     kernel = WendlandC2(0.1, 2)
     edges = radius_graph(torch.zeros(4, 2), math.nextafter(kernel.support_radius, 0))
-    assert [operator().isfinite().all().item() for operator in every_operator(edges, kernel)] == [True] * 3
+    assert [operator().isfinite().all().item() for operator in every_operator(edges, kernel)] == [True] * 4
 
 
 def test_kernel_must_have_the_dimension_of_the_edges():
