@@ -249,12 +249,12 @@ class WindowState(FluidState):
     Attributes:
         accelerations: Second differences of the positions ÷ Δt², newest first, (N, H - 2, D).
         is_fluid: Which particles are fluid, (N,), bool.
-        force: Constant external acceleration (D,), 0 where there is none.
+        forces: External acceleration at each particle (N, D), 0 in a scene without a force.
     """
 
     accelerations: Float[Tensor, "N K D"]
     is_fluid: Bool[Tensor, " N"]
-    force: Float[Tensor, " D"]
+    forces: Float[Tensor, "N D"]
 
     @property
     def fluid_masses(self) -> Float[Tensor, " M"]:
@@ -269,16 +269,16 @@ def window_state(window: Window, history: int, scene: Scene, kernel: AbstractKer
         ShapeError: If the window has fewer frames.
     """
     velocities = window.displacements(scene.box, history) / scene.frame_dt
-    force = torch.zeros(scene.dim) if scene.force is None else torch.tensor(scene.force)
+    positions = window.present.double()
     return WindowState(
-        positions=window.present.double(),
+        positions=positions,
         velocities=velocities[-1],
         masses=window.masses.double(),
         box=scene.box,
         kernel=kernel,
         accelerations=(velocities.diff(dim=0) / scene.frame_dt).flip(0).transpose(0, 1),
         is_fluid=window.is_fluid,
-        force=force.double(),
+        forces=torch.zeros_like(positions) if scene.force is None else scene.force(positions),
     )
 
 
@@ -290,7 +290,7 @@ _SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
 }
 _VECTORS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N, V, D) of a state
     ACCELERATIONS: lambda state, units: state.accelerations / units.acceleration,
-    FORCE: lambda state, units: (state.force / units.acceleration).expand_as(state.velocities)[:, None],
+    FORCE: lambda state, units: state.forces[:, None] / units.acceleration,
     VELOCITY: lambda state, units: state.velocities[:, None] / units.velocity,
 }
 
