@@ -42,7 +42,7 @@ def test_velocity_and_accelerations_are_the_history_newest_first(generator):
     expected = steps.diff(dim=0).flip(0).transpose(0, 1)
     torch.testing.assert_close(column(features, "accelerations").double(), expected, rtol=1e-4, atol=1e-5)
     assert features.vector_names[-1] == "velocity"  # networks that know it as differences leave out the last vector
-    assert features.kinds == TASK.kinds(TASK.features) == Kinds(3, 6)
+    assert features.kinds == TASK.kinds(TASK.features) == Kinds(4, 7)
 
 
 def test_a_uniform_motion_leaves_everything_but_the_velocity(generator):
