@@ -43,7 +43,7 @@ def test_models_of_all_histories_are_compared_at_the_same_presents(run, cconv):
         assert (card["window"], config["history"]) == (6, card["parameters"].get("task.history"))
         code, printed, _ = cconv("evaluate", run.path / entry.checkpoint, "--split", "valid", "--json")
         assert code == 0
-        assert json.loads(printed)["rollout_mse"] == pytest.approx(card["valid_error"], rel=1e-4)
+        assert json.loads(printed)["rollout_mse"] == pytest.approx(card["valid_error"], rel=1e-3)
 
 
 def test_the_report_speaks_of_rollouts(run):
