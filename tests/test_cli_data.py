@@ -5,6 +5,7 @@ from outcomes import assert_one_clear_line
 from particle_files import record_frames, write_hdf5, write_parts
 
 from cconv.data.dataset import open_dataset
+from cconv.forces import ConstantForce
 
 SMALL = ["--size", "small", "--trajectories", "3", "--frames", "4", "--particle-spacing", "0.125", "--workers", "1"]
 
@@ -24,7 +25,7 @@ def test_inspect_prints_json_for_programs(cconv, tmp_path):
     status, out, _ = cconv("data", "inspect", tmp_path / "a", "--json", "--cutoff", 0.5, "--force", "0,-9.81,0")
     facts = json.loads(out)
     assert status == 0
-    assert facts["force"] == [0.0, -9.81, 0.0]
+    assert facts["force"] == {"name": "constant", "acceleration": [0.0, -9.81, 0.0]}
     assert facts["neighbors"]["cutoff"] == 0.5
     assert facts["format"] == "DeepLagrangianFluids"
 
@@ -43,7 +44,7 @@ def test_convert_keeps_what_was_given(cconv, tmp_path):
     status, _, _ = cconv("data", "convert", tmp_path / "a", "--out", tmp_path / "b", *given)
     scene = open_dataset(tmp_path / "b").scene
     assert status == 0
-    assert (scene.particle_spacing, scene.frame_dt, scene.force) == (0.1, 0.02, (0.0, -1.0, 0.0))
+    assert (scene.particle_spacing, scene.frame_dt, scene.force) == (0.1, 0.02, ConstantForce((0.0, -1.0, 0.0)))
     assert open_dataset(tmp_path / "b").trajectory("train", 0).masses.tolist() == [0.5] * 5
 
 

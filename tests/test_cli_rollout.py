@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from conftest import run_main
 from outcomes import assert_one_clear_line
+from particle_files import record_frames, write_parts
 
 from cconv.data.dataset import open_dataset
+from cconv.forces import ConstantForce
 
 STUDY = """
 name = "steps"
@@ -59,6 +61,28 @@ def test_a_closed_form_of_steps_is_better_than_going_on(fitted, cconv):
     assert facts["rollout_mse"] < facts["mean_predictor_rollout_mse"]
     assert facts["frames"] == 2  # windows of 3 frames and rollouts of 5, as the study said, in 16 frames
     assert json.loads(cconv("evaluate", fitted, "--horizon", 10, "--json")[1])["frames"] == 1
+
+
+def test_a_step_is_trained_and_rolled_out_on_deep_lagrangian_fluids(cconv, tmp_path):
+    """Wall points with normals are walls, and what the files do not hold is given: force, spacing."""
+    for seed in range(3):
+        write_parts(tmp_path / "data", name=f"sim_{seed}", frames=record_frames(num_particles=12, seed=seed))
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=2))
+    given = ["--set", "data.force=[0, -9.81, 0]", "--set", "data.particle_spacing=0.4"]
+    code, _, _ = cconv(
+        "train", tmp_path / "study.toml", "--data", tmp_path / "data", "--out", tmp_path / "model", *given
+    )
+    assert code == 0
+    checkpoint = tmp_path / "model" / "checkpoint"
+    config = json.loads((checkpoint / "config.json").read_text())
+    assert {"force", "wall_distance", "wall_normal", "walls"} <= set(config["features"])
+    assert config["wall_vectors"] == 1
+    code, _, _ = cconv("rollout", checkpoint, "--frames", 3, "--out", tmp_path / "out")
+    assert code == 0
+    stored, rolled = (open_dataset(tmp_path / name).trajectory("test", 0).boundary for name in ("data", "out"))
+    assert np.array_equal(rolled.positions, stored.positions)
+    assert np.array_equal(rolled.normals, stored.normals)
+    assert open_dataset(tmp_path / "out").scene.force == ConstantForce((0.0, -9.81, 0.0))
 
 
 def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, tmp_path):

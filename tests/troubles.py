@@ -9,7 +9,7 @@ from conftest import SMOKE
 
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.problem import Problem, load_problem, open_study_data, with_data_path
+from cconv.study.running.problem import Problem, load_problem, open_study_data, study_task, with_data_path
 from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
 from cconv.study.studies import load_study
 
@@ -54,7 +54,8 @@ def study_of(data, *settings) -> StudyConfig:
 def troubled_problem(data) -> TroubledProblem:
     """What the trainings of `study_of` share."""
     study = study_of(data)
-    return TroubledProblem(**vars(load_problem(study, open_study_data(study.data, study.seeds.data))))
+    dataset = open_study_data(study.data, study.seeds.data)
+    return TroubledProblem(**vars(load_problem(study, dataset, study_task(study, dataset.scene))))
 
 
 def jobs_in(folder, seeds) -> list[Job]:

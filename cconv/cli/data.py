@@ -341,7 +341,7 @@ def _rows(facts: dict) -> list[tuple[str, str]]:
         ("box", ", ".join(bounds)),
         ("periodic axes", ", ".join(periodic) or "none"),
         ("boundary points", f"{_range_text(boundary['points'])} {normals}" if boundary["points"]["max"] else "none"),
-        ("force", "none known" if facts["force"] is None else ", ".join(f"{value:g}" for value in facts["force"])),
+        ("force", _force_text(facts["force"])),
         ("velocities", facts["velocity_source"]),
         ("masses", f"{facts['mass_source']} ({_range_text(facts['mass'])})"),
         ("speed", f"mean {facts['speed']['mean']:.4g}, largest {facts['speed']['max']:.4g}"),
@@ -354,6 +354,14 @@ def _rows(facts: dict) -> list[tuple[str, str]]:
 
 def _split_text(counts: dict) -> str:
     return f"{counts['trajectories']} trajectories, {counts['frames']} frames"
+
+
+def _force_text(declared: dict | None) -> str:
+    """Name and parameters of a force in words."""
+    if declared is None:
+        return "none known"
+    parameters = (f"{key} {value}" for key, value in declared.items() if key != "name")
+    return f"{declared['name']} ({', '.join(parameters)})"
 
 
 def _range_text(values: dict) -> str:

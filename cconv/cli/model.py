@@ -4,6 +4,7 @@ import math
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -150,10 +151,11 @@ def evaluate(
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     rolled = horizon or card.get("horizon") or HORIZON
+    windows = replace(model.task, history=card.get("window") or model.task.history)  # as its study compared models
 
     def samples(split: str, verb: str) -> list:
         label = f"{verb} {split}"
-        return list(show_progress(compared_samples(dataset, split, model.task, rolled), label))
+        return list(show_progress(compared_samples(dataset, split, windows, rolled), label))
 
     asked, objective = samples(split, "read"), objective_of(model.task)
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None
@@ -269,7 +271,7 @@ def report(path: RunPath) -> None:
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Return settings, samples and data of a study whose single model is written to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
-    from cconv.study.running.problem import load_problem, open_study_data, with_data_path
+    from cconv.study.running.problem import load_problem, open_study_data, study_task, with_data_path
     from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
@@ -279,4 +281,4 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
         raise ConfigError(f"{out}: exists already; give another --out.")
     dataset = open_study_data(config.data, config.seeds.data)
     print_findings(dataset_findings(dataset, show_progress))
-    return config, load_problem(config, dataset, show_progress), dataset
+    return config, load_problem(config, dataset, study_task(config, dataset.scene), show_progress), dataset

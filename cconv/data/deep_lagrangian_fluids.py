@@ -121,7 +121,7 @@ class DeepLagrangianFluidsSource:
         name = self.names[0]
         trajectory = self.read(name, 0, max(2, _count_frames(self._parts[name][0])))
         dim = trajectory.positions.shape[2]
-        force = self._given.checked_force(dim)
+        force = self._given.force_in(dim)
         spacing = self._given.particle_spacing or PARTICLE_SPACING
         frame_dt = self._given.frame_dt or _estimate_frame_dt(trajectory, self._parts[name][0])
         mass_source = self._mass_source(trajectory, dim)

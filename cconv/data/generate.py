@@ -261,18 +261,17 @@ def _trajectory(scene: SimulatedScene, file: Path, start: int, stop: int | None)
 
 def _describe(scene: SimulatedScene) -> Scene:
     features = scene.features
-    varies = "not constant; it depends on position, see the scene's file"
     return Scene(
         name=scene.name,
         dim=scene.dim,
         particle_spacing=scene.particle_spacing,
         frame_dt=scene.frame_dt,
         box=scene.box,
-        force=scene.gravity,
+        force=scene.force,
         has_boundary=features["walls"],
         velocity_source=STORED,
         mass_source=STORED,
-        missing=(f"force: {varies}",) if scene.has_force and scene.gravity is None else (),
+        missing=(),
     )
 
 

@@ -44,10 +44,10 @@ class LagrangeBenchSource:
     """Trajectories of a LagrangeBench folder or of one of ours.
 
     Velocities that are not stored are central differences of positions, masses that are not stored are ``dx ** D``
-    (rest density 1). Wall particles at frame 0 are the boundary unless boundary points are stored. The force is
-    gravity for dam breaks; a position-dependent force is only named in `scene.missing`, and a force.py beside the
-    data is never run. LagrangeBench marks sets with walls as periodic although their walls close the box: harmless, as
-    no particle reaches an edge.
+    (rest density 1). Wall particles at frame 0 are the boundary unless boundary points are stored. The force is the
+    one that the case of the set is known for (dam break, reverse Poiseuille flow) or that our key declares by name; any
+    other is only mentioned in `scene.missing`, and a force.py beside the data is never run. LagrangeBench marks sets
+    with walls as periodic although their walls close the box: harmless, as no particle reaches an edge.
 
     Args:
         folder: Where the files are.

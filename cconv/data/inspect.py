@@ -68,7 +68,7 @@ def _scene_facts(scene: Scene) -> dict:
             "upper": list(scene.box.upper),
             "periodic": list(scene.box.periodic),
         },
-        "force": None if scene.force is None else list(scene.force),
+        "force": None if scene.force is None else scene.force.declaration(),
         "velocity_source": scene.velocity_source,
         "mass_source": scene.mass_source,
     }

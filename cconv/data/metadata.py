@@ -6,7 +6,6 @@ Source: Toshev et al. (2023), LagrangeBench: A Lagrangian Fluid Mechanics Benchm
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -15,7 +14,8 @@ from cconv.data.limits import one_line
 from cconv.data.source import LARGEST, SMALLEST, STORED, Given
 from cconv.data.trajectory import Scene
 from cconv.domain import Box
-from cconv.errors import DataError, ShapeError
+from cconv.errors import ConfigError, DataError, ShapeError
+from cconv.forces import ConstantForce, Force, ReversePoiseuilleForce, force_declared
 
 METADATA = "metadata.json"
 OWN_KEY = "cconv"
@@ -23,6 +23,7 @@ MOST_BYTES = 2**20
 MOST_LINES = 50  # of what is missing
 DIFFERENCES = "central differences of positions"
 DAM_BREAK_CASES = ("db", "dam", "dam break")
+REVERSE_POISEUILLE_CASES = ("rpf",)
 OVERRIDES = {"mass": "masses", "particle_spacing": "particle spacing", "frame_dt": "frame dt", "force": "force"}
 
 
@@ -76,7 +77,7 @@ def scene_from_metadata(
     frame_dt = given.frame_dt or _frame_dt(metadata, file)
     own = metadata.get(OWN_KEY) or _deduced(metadata, file, dim, stores_velocity, stores_mass)
     mass_source = one_line(own.get("mass_source", STORED)) if stores_mass else default_mass_source(spacing, dim)
-    force = given.checked_force(dim) or _own(own, "force", file, lambda value: _is_vector(value, dim), f"{dim} numbers")
+    force = given.force_in(dim) or _stored_force(own, file, dim)
     overridden = tuple(f"{topic}:" for name, topic in OVERRIDES.items() if getattr(given, name) is not None)
     missing = _own(own, "missing", file, lambda value: isinstance(value, list), "a list of lines") or []
     return Scene(
@@ -85,7 +86,7 @@ def scene_from_metadata(
         particle_spacing=spacing,
         frame_dt=frame_dt,
         box=_box(metadata, dim, file),
-        force=tuple(force) if force else None,
+        force=force,
         has_boundary=has_boundary,
         velocity_source=STORED if stores_velocity else DIFFERENCES,
         mass_source=f"given: {given.mass:g}" if given.mass else mass_source,
@@ -112,7 +113,7 @@ def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> d
         "artificial_alpha": None,
         "free_slip": None,
         "is_bc_trick": False,
-        "g_ext_magnitude": math.hypot(*scene.force) if scene.force else 0.0,
+        "g_ext_magnitude": scene.force.largest if scene.force else 0.0,
         **stored,
         "dim": scene.dim,
         "dx": scene.particle_spacing,
@@ -125,7 +126,7 @@ def metadata_from_scene(scene: Scene, stored: Mapping, statistics: Mapping) -> d
         OWN_KEY: {
             **stored.get(OWN_KEY, {}),
             "name": scene.name,
-            "force": list(scene.force) if scene.force else None,
+            "force": scene.force.declaration() if scene.force else None,
             "mass_source": scene.mass_source,
             "missing": list(scene.missing),
         },
@@ -144,19 +145,32 @@ def _deduced(metadata: Mapping, file: Path, dim: int, stores_velocity: bool, sto
     return {"name": file.parent.name, "force": force, "missing": lines}
 
 
-def _external_force(metadata: Mapping, file: Path, dim: int) -> tuple[list[float] | None, str | None]:
-    """Constant force, and what cannot be said about it. Gravity of a dam break acts on axis 1."""
+def _external_force(metadata: Mapping, file: Path, dim: int) -> tuple[dict | None, str | None]:
+    """Declaration of the force that the case of a LagrangeBench set has, and what cannot be said about it."""
     magnitude = 0.0
     if metadata.get("g_ext_magnitude") is not None:
-        magnitude = _value(metadata, "g_ext_magnitude", file, _is_number, f"a number of at most {LARGEST:g}")
+        magnitude = float(_value(metadata, "g_ext_magnitude", file, _is_number, f"a number of at most {LARGEST:g}"))
     case = str(metadata.get("case", "")).lower()
     if magnitude and case in DAM_BREAK_CASES and dim > 1:
-        return [-float(magnitude) if axis == 1 else 0.0 for axis in range(dim)], None
+        down = tuple(-magnitude if axis == 1 else 0.0 for axis in range(dim))
+        return ConstantForce(down).declaration(), None
+    if magnitude and case in REVERSE_POISEUILLE_CASES and dim > 1:
+        return ReversePoiseuilleForce(magnitude, _box(metadata, dim, file).lengths[1]).declaration(), None
     if magnitude:
         return None, f"of magnitude {magnitude:g} acts, but its direction is not stored (it may depend on position)"
     if (file.parent / "force.py").exists():
         return None, "given by force.py, which is never run"
     return None, None
+
+
+def _stored_force(own: Mapping, file: Path, dim: int) -> Force | None:
+    """The force that our key declares, or None."""
+    if own.get("force") is None:
+        return None
+    try:
+        return force_declared(own["force"], dim)
+    except ConfigError as error:
+        raise DataError(f"{file}: `{OWN_KEY}.force`: {error}; correct it.") from error
 
 
 def _box(metadata: Mapping, dim: int, file: Path) -> Box:

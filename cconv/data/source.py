@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cconv.data.trajectory import Scene, Trajectory
 from cconv.errors import ConfigError, DataError
+from cconv.forces import ConstantForce
 
 SPLITS = ("train", "valid", "test")
 STORED = "stored"
@@ -45,11 +46,11 @@ class Given:
             if not all(abs(value) <= LARGEST for value in self.force):
                 raise ConfigError(f"`force` must be finite, at most {LARGEST:g}, got {self.force}.")
 
-    def checked_force(self, dim: int) -> tuple[float, ...] | None:
-        """The force, after a check that it has one number an axis."""
+    def force_in(self, dim: int) -> ConstantForce | None:
+        """The given force, after a check that it has one number an axis; None if none is given."""
         if self.force is not None and len(self.force) != dim:
             raise ConfigError(f"`force` must have one number an axis ({dim}), got {len(self.force)}.")
-        return self.force
+        return None if self.force is None else ConstantForce(self.force)
 
 
 class TrajectorySource(Protocol):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError
+from cconv.forces import Force
 
 
 class ParticleType(IntEnum):
@@ -44,7 +45,7 @@ class Scene:
         particle_spacing: Initial distance of neighbouring particles, dx.
         frame_dt: Time between stored frames.
         box: Bounds and periodic axes.
-        force: Constant external acceleration, D numbers, or None if there is none or it is not known.
+        force: External acceleration as a function of the position, or None if there is none or it is not known.
         has_boundary: Whether there are wall points or wall particles.
         velocity_source: Where velocities come from: "stored" or "central differences of positions".
         mass_source: Where masses come from: "stored", or the value that stands in for them and why.
@@ -56,7 +57,7 @@ class Scene:
     particle_spacing: float
     frame_dt: float
     box: Box
-    force: tuple[float, ...] | None
+    force: Force | None
     has_boundary: bool
     velocity_source: str
     mass_source: str

@@ -45,6 +45,10 @@ class Window:
         """Which particles a model moves, (N,), bool."""
         return self.particle_types == ParticleType.FLUID
 
+    def ending(self, history: int) -> "Window":
+        """The same window without its oldest frames: at most `history` up to the present."""
+        return replace(self, positions=self.positions[-history:])
+
     def displacements(self, box: Box, history: int) -> Tensor:
         """Displacement of each particle from frame to frame of the last `history` ones, (history - 1, N, D), float64.
 

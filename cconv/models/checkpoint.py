@@ -27,6 +27,7 @@ class _Card(OpenModel):
 
     data: dict = {}
     data_seed: Seed = 0
+    window: Horizon | None = None
     horizon: Horizon | None = None
     valid_error: Real | None = None
 

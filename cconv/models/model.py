@@ -284,13 +284,19 @@ def build_model(
 
 
 def absent_features(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:
-    """Optional features that are 0 in all samples, or that none has, such as a force in a scene without one."""
+    """Optional features that tell nothing: one number, or zero vectors, for all particles of all samples.
+
+    So are a force in a scene without one, and distances to walls in a scene without any.
+    """
     unseen = {name for name in names if name in task.optional and name != WALLS}
+    usual = None
     for sample in samples:
         if not unseen:
             break
         features = sample.inputs.features
-        flat = features.flat().abs().amax(dim=0) > 0
+        if usual is None:
+            usual = torch.cat([features.scalars[0], torch.zeros_like(features.vectors[0].flatten())])
+        flat = (features.flat() != usual).any(dim=0)
         unseen -= {name for name, seen in zip(features.columns, flat.tolist(), strict=True) if seen}
     return unseen
 

@@ -27,6 +27,7 @@ from cconv.data.folders import whole_file
 from cconv.data.quantities import density_deviation, speed
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory, check_frames
 from cconv.errors import ConfigError, check_choice
+from cconv.forces import ConstantForce, Force
 
 Progress = Callable[[Iterable, str], Iterable]
 
@@ -235,6 +236,11 @@ def _coloring(color: str, trajectory: Trajectory, scene: Scene, frames: Sequence
     return COLORINGS[color](trajectory, scene, progress(frames, color))
 
 
+def _vertical_axis(force: Force | None) -> str:
+    """Name of the axis along which a constant force is largest; y if there is none."""
+    return "xyz"[int(np.argmax(np.abs(force.acceleration)))] if isinstance(force, ConstantForce) else "y"
+
+
 def _is_wall(types: np.ndarray) -> np.ndarray:
     return np.isin(types, (ParticleType.SOLID_WALL, ParticleType.MOVING_WALL))
 
@@ -290,14 +296,14 @@ class _Plane:
 
 
 class _Space:
-    """Three dimensions, seen from above; the axis of the force is vertical, y where no force is known."""
+    """Three dimensions, seen from above; the axis of a constant force is vertical, y where there is none."""
 
     projection: str | None = "3d"
     aspect: float = 0.85
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self._vertical = "xyz"[int(np.argmax(np.abs(scene.force)))] if scene.force else "y"
+        self._vertical = _vertical_axis(scene.force)
 
     def prepare(self, axes: Axes3D, trajectory: Trajectory) -> None:
         box = self._scene.box

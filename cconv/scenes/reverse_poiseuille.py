@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cconv.domain import Box
+from cconv.forces import Force, ReversePoiseuilleForce
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.scenes.walls import whole_cells
 
@@ -32,15 +33,9 @@ class _ReversePoiseuille(SimulatedScene):
         return Box((0.0,) * self.dim, upper, periodic=True)
 
     @property
-    def largest_force(self) -> float:
-        """1 everywhere."""
-        return 1.0
-
-    def force(self, positions: Tensor) -> Tensor:
+    def force(self) -> Force:
         """Forward in the lower half, backward in the upper."""
-        force = torch.zeros_like(positions)
-        force[:, 0] = torch.where(positions[:, 1] > 1, -1.0, 1.0)
-        return force
+        return ReversePoiseuilleForce(magnitude=1.0, height=self.box.lengths[1])
 
     def fluid(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """A relaxed lattice at rest."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError
+from cconv.forces import ConstantForce, Force
 from cconv.scenes.relaxed import relaxed
 from cconv.scenes.walls import WALL_LAYERS, Walls, lattice
 from cconv.sph.kernels import QuinticSpline
@@ -125,14 +126,14 @@ class SimulatedScene(ABC):
         return None
 
     @property
-    def largest_force(self) -> float:
-        """Magnitude of the external acceleration."""
-        return math.hypot(*self.gravity) if self.gravity else 0.0
+    def force(self) -> Force | None:
+        """External acceleration, or None; gravity by default."""
+        return None if self.gravity is None else ConstantForce(self.gravity)
 
     @property
-    def has_force(self) -> bool:
-        """Whether an external acceleration acts."""
-        return self.largest_force > 0
+    def largest_force(self) -> float:
+        """Largest magnitude of the external acceleration."""
+        return 0.0 if self.force is None else self.force.largest
 
     @property
     def features(self) -> dict[str, bool]:
@@ -142,14 +143,10 @@ class SimulatedScene(ABC):
             "walls": len(walls) > 0,
             "moving_walls": bool(walls.velocities.any()),
             "periodic": any(self.box.periodic),
-            "force": self.has_force,
+            "force": self.force is not None,
             "free_surface": self.free_surface,
             "varying_viscosity": self.varying_viscosity,
         }
-
-    def force(self, positions: Tensor) -> Tensor:
-        """External acceleration (N, D) at positions (N, D): gravity by default."""
-        return torch.tensor(self.gravity, dtype=positions.dtype).expand_as(positions)
 
     def draw_viscosity(self, generator: torch.Generator) -> float:
         """Kinematic viscosity of a trajectory; the same for all by default."""
@@ -181,7 +178,7 @@ class SimulatedScene(ABC):
             scheme=Scheme(
                 density=self.density_scheme, artificial_viscosity=self.artificial_viscosity * 10 / eos.sound_speed
             ),
-            force=self.force if self.has_force else None,
+            force=self.force,
         )
 
     def initial_state(self, generator: torch.Generator) -> ParticleState:

@@ -12,7 +12,7 @@ from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
-from cconv.study.declared.search_space import check_baseline_affordable
+from cconv.study.declared.search_space import check_baseline_affordable, longest_history
 from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
@@ -24,7 +24,14 @@ from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import OptunaMirror, database_answers, open_mirror
 from cconv.study.running.pool import Pool
 from cconv.study.running.private_folder import remove_left_behind
-from cconv.study.running.problem import Problem, check_test_split, load_problem, open_study_data, with_data_path
+from cconv.study.running.problem import (
+    Problem,
+    check_test_split,
+    load_problem,
+    open_study_data,
+    study_task,
+    with_data_path,
+)
 from cconv.study.running.serial_pool import SerialPool
 from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
@@ -144,10 +151,12 @@ def _session(
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
     dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
-    check_test_split(study, dataset)
-    problem = load_problem(study, dataset, progress)
-    if not dataset.scene.has_boundary:
-        space = fixed(space, feature_path(WALLS))  # nothing to search where there are no walls
+    task = study_task(study, dataset.scene, longest_history(space, study))
+    check_test_split(study, dataset, task)
+    problem = load_problem(study, dataset, task, progress)
+    for name in problem.task.optional:
+        if name not in problem.present_features or (name == WALLS and not dataset.scene.has_boundary):
+            space = fixed(space, feature_path(name))  # nothing to search, e.g. where there are no walls
     count_cost = CostCounter(study, problem)
     check_baseline_affordable(space, count_cost)
     with ExitStack() as stack:

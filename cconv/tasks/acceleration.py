@@ -8,6 +8,8 @@ from cconv.tasks.features import (
     FORCE,
     PARTICLE_TYPE,
     VELOCITY,
+    WALL_DISTANCE,
+    WALL_NORMAL,
     WALLS,
     Units,
 )
@@ -20,8 +22,11 @@ class Acceleration(StepTask):
 
     Features: the velocity, the last displacement, which networks know only as differences where their messages take
     differences of vectors; the `history - 2` accelerations before; SPH density; whether a particle is one of a wall;
-    a constant external force. Source: Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph
-    Networks" (ICML 2020), section 4.1, whose velocities are those sums; LagrangeBench (Toshev et al., 2023).
+    how near the nearest wall point is and the direction away from the walls, both within the support radius of the
+    task's kernel; the external force at the particle's place. Wall particles have velocities as well: the difference
+    from a lid that slides is its velocity relative to the fluid, and needs no feature of its own. Source:
+    Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks" (ICML 2020), section 4.1, whose
+    velocities are those sums, with distances to walls clipped at the cutoff; LagrangeBench (Toshev et al., 2023).
     """
 
     name = "acceleration"
@@ -31,8 +36,18 @@ class Acceleration(StepTask):
         "follows; a model is rolled out by its own answers."
     )
     output = Kinds(0, 1)
-    features = (CONSTANT, DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, VELOCITY, WALLS)
-    optional = (DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, WALLS)
+    features = (
+        CONSTANT,
+        DENSITY,
+        PARTICLE_TYPE,
+        WALL_DISTANCE,
+        ACCELERATIONS,
+        FORCE,
+        WALL_NORMAL,
+        VELOCITY,
+        WALLS,
+    )
+    optional = (DENSITY, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
     checks = ("completion", "motion", "packing")
     integrator = SemiImplicitEuler()
 

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.data.window import Window
@@ -24,6 +25,7 @@ from cconv.sph.operators import density
 
 CONSTANT, DENSITY, PARTICLE_TYPE, NORMAL = "one", "density", "particle_type", "normal"  # names of features
 ACCELERATIONS, FORCE, VELOCITY = "accelerations", "force", "velocity"
+WALL_DISTANCE, WALL_NORMAL = "wall_distance", "wall_normal"
 WALLS = "walls"  # stands among the features of a task for those of the wall points
 
 
@@ -132,6 +134,11 @@ class Features:
     def to(self, dtype: torch.dtype) -> "Features":
         """The same in another type of numbers."""
         return replace(self, scalars=self.scalars.to(dtype), vectors=self.vectors.to(dtype))
+
+
+def features_in(names: Sequence[str], history: int) -> tuple[str, ...]:
+    """Those of some features that windows of so many frames have; two have no acceleration before the present."""
+    return tuple(name for name in names if name != ACCELERATIONS or history > 2)
 
 
 def kinds_of(names: Sequence[str], history: int = 1) -> Kinds:
@@ -249,36 +256,80 @@ class WindowState(FluidState):
     Attributes:
         accelerations: Second differences of the positions ÷ Δt², newest first, (N, H - 2, D).
         is_fluid: Which particles are fluid, (N,), bool.
-        force: Constant external acceleration (D,), 0 where there is none.
+        wall_points: Points that represent the walls now (B, D); none in a scene without walls.
+        forces: External acceleration at each particle (N, D), 0 in a scene without a force.
     """
 
     accelerations: Float[Tensor, "N K D"]
     is_fluid: Bool[Tensor, " N"]
-    force: Float[Tensor, " D"]
+    wall_points: Float[Tensor, "B D"]
+    forces: Float[Tensor, "N D"]
 
     @property
     def fluid_masses(self) -> Float[Tensor, " M"]:
         """Masses of the fluid particles (M,)."""
         return self.masses[self.is_fluid]
 
+    @cached_property
+    def wall_edges(self) -> Edges:
+        """Wall points within the kernel's support of the fluid particles, which are counted among themselves."""
+        fluid = self.positions[self.is_fluid]
+        return radius_graph(self.wall_points, self.kernel.support_radius, self.box, queries=fluid)
 
-def window_state(window: Window, history: int, scene: Scene, kernel: AbstractKernel) -> WindowState:
+    @cached_property
+    def wall_distances(self) -> Float[Tensor, " N"]:
+        """Distance to the nearest wall point ÷ support radius of the kernel, at most 1, (N,); 0 for wall particles."""
+        edges = self.wall_edges
+        nearest = torch.ones(edges.num_receivers, dtype=edges.distances.dtype)
+        nearest.scatter_reduce_(0, edges.receivers, edges.distances / edges.cutoff, "amin")
+        distances = torch.zeros_like(self.masses)
+        distances[self.is_fluid] = nearest
+        return distances
+
+    @property
+    def wall_normals(self) -> Float[Tensor, "N D"]:
+        """Direction away from the walls, of length 1 at a wall point and 0 from the support radius on, (N, D).
+
+        It is the direction of the mean of the unit vectors from wall points, weighted by the kernel: along a flat wall
+        it hardly turns from point to point, as the direction from the nearest one would. Wall particles have none.
+        """
+        edges = self.wall_edges
+        weights = self.kernel.value(edges.distances)[:, None]
+        sums = torch.zeros_like(self.positions[self.is_fluid])
+        sums.index_add_(0, edges.receivers, weights * normalize(edges.displacements, dim=1))
+        directions = normalize(sums, dim=1)
+        normals = torch.zeros_like(self.positions)
+        normals[self.is_fluid] = directions * (1 - self.wall_distances[self.is_fluid, None])
+        return normals
+
+
+def window_state(
+    window: Window, history: int, boundary: Boundary | None, scene: Scene, kernel: AbstractKernel
+) -> WindowState:
     """Particles at the end of a window, and what its last `history` frames say of their motion.
+
+    Args:
+        window: The window.
+        history: Frames up to the present.
+        boundary: Wall points; None where the particles that are not fluid are the walls.
+        scene: Scene of the window.
+        kernel: SPH kernel.
 
     Raises:
         ShapeError: If the window has fewer frames.
     """
     velocities = window.displacements(scene.box, history) / scene.frame_dt
-    force = torch.zeros(scene.dim) if scene.force is None else torch.tensor(scene.force)
+    positions = window.present.double()
     return WindowState(
-        positions=window.present.double(),
+        positions=positions,
         velocities=velocities[-1],
         masses=window.masses.double(),
         box=scene.box,
         kernel=kernel,
         accelerations=(velocities.diff(dim=0) / scene.frame_dt).flip(0).transpose(0, 1),
         is_fluid=window.is_fluid,
-        force=force.double(),
+        wall_points=positions[~window.is_fluid] if boundary is None else boundary.positions.double(),
+        forces=torch.zeros_like(positions) if scene.force is None else scene.force(positions),
     )
 
 
@@ -287,10 +338,12 @@ _SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
     CONSTANT: lambda state, units: torch.ones_like(state.masses),
     DENSITY: lambda state, units: state.densities / units.density,
     PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
+    WALL_DISTANCE: lambda state, units: state.wall_distances,
 }
 _VECTORS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N, V, D) of a state
     ACCELERATIONS: lambda state, units: state.accelerations / units.acceleration,
-    FORCE: lambda state, units: (state.force / units.acceleration).expand_as(state.velocities)[:, None],
+    FORCE: lambda state, units: state.forces[:, None] / units.acceleration,
+    WALL_NORMAL: lambda state, units: state.wall_normals[:, None],
     VELOCITY: lambda state, units: state.velocities[:, None] / units.velocity,
 }
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -91,7 +91,7 @@ class WindowSamples(Sequence[StepSample]):
     """Samples of windows, each made when it is asked for, because windows share their frames and samples do not.
 
     Args:
-        windows: Windows with at least one frame of future.
+        windows: Windows with at least one frame of future, and at least as long as the history of the task.
         scene: Their scene.
         task: What is asked.
     """
@@ -105,7 +105,15 @@ class WindowSamples(Sequence[StepSample]):
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return WindowSamples(self.windows[index], self.scene, self.task)
-        return make_step_sample(self.windows[index], self.scene, self.task)
+        return make_step_sample(self.window(index), self.scene, self.task)
+
+    def window(self, index: int) -> Window:
+        """The window of a sample, no longer than the history of the task."""
+        return self.windows[index].ending(self.task.history)
+
+    def of_history(self, history: int) -> "WindowSamples":
+        """Samples of the same presents whose answers depend on fewer frames."""
+        return WindowSamples(self.windows, self.scene, replace(self.task, history=history))
 
     @cached_property
     def spread(self) -> list[StepSample]:

@@ -163,8 +163,8 @@ class StepTask(Task):
         points count only where there are none.
         """
         kernel = self.kernel_at(scene.particle_spacing, scene.dim)
-        state = window_state(observed, self.history, scene, kernel)
         boundary = observed.boundary if bool(observed.is_fluid.all()) else None
+        state = window_state(observed, self.history, boundary, scene, kernel)
         return replace(make_inputs(state, boundary, scene, names), answered=observed.is_fluid)
 
 

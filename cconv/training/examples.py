@@ -65,7 +65,7 @@ class AugmentedExamples:
         state = np.random.SeedSequence([self.seed, update, index]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state[0] >> 1))
         scene = self.samples.scene
-        window = self.augmentation(self.samples.windows[index], scene, generator)
+        window = self.augmentation(self.samples.window(index), scene, generator)
         steps = min(self.pushforward.steps(update, generator), len(window.future) - 1)
         window = pushed(model, window, scene, steps)
         return make_step_sample(window, scene, self.samples.task)

@@ -26,7 +26,14 @@ from cconv.study.declared.search_space import load_space
 from cconv.study.declared.stage import BASELINE
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.problem import load_problem, open_study_data, provenance, study_samples, with_data_path
+from cconv.study.running.problem import (
+    load_problem,
+    open_study_data,
+    provenance,
+    study_samples,
+    study_task,
+    with_data_path,
+)
 from cconv.study.running.trial import Trial, run_trial
 from cconv.study.studies import load_study
 
@@ -55,7 +62,8 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
         of the best checkpoint, "valid" and "test", beside those of predicting the mean.
     """
     dataset = open_study_data(study.data, study.seeds.data)
-    problem = load_problem(study, dataset)
+    task = study_task(study, dataset.scene)
+    problem = load_problem(study, dataset, task)
     training = study.training.model_copy(update={"updates": updates})
     folder = TrialFolder(place)
     trial = Trial(
@@ -66,7 +74,7 @@ def train(study: StudyConfig, model: str, seed: int, updates: int, place: Path) 
     for _ in track(entries, f"{model}, seed {seed}", total=updates // training.evaluate_every):
         pass
     best = load_model(folder.checkpoint)
-    samples = {"valid": problem.valid_samples, "test": study_samples(study, dataset, "test")}
+    samples = {"valid": problem.valid_samples, "test": study_samples(study, dataset, "test", task)}
     objective = problem.objective
     errors = {split: objective.error(best, each) for split, each in samples.items()}
     mean = {split: objective.of_mean_predictor(each, problem.train_samples) for split, each in samples.items()}

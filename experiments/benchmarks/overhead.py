@@ -17,7 +17,14 @@ import torch
 
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.problem import Problem, load_problem, open_study_data, provenance, with_data_path
+from cconv.study.running.problem import (
+    Problem,
+    load_problem,
+    open_study_data,
+    provenance,
+    study_task,
+    with_data_path,
+)
 from cconv.study.running.ray_pool import ray_pool
 from cconv.study.running.trial import Trial, run_trial
 from cconv.study.running.trial_queue import Job, NothingStops, TrialQueue
@@ -81,7 +88,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     study = with_data_path(load_study(SMOKE, [*ONE_UPDATE, f"search.concurrency={arguments.workers}"]), arguments.data)
-    problem = load_problem(study, open_study_data(study.data, study.seeds.data))
+    dataset = open_study_data(study.data, study.seeds.data)
+    problem = load_problem(study, dataset, study_task(study, dataset.scene))
     with tempfile.TemporaryDirectory(prefix="cconv_") as folder:
         alone = seconds_alone(study, problem, Path(folder) / "alone")
         between = seconds_between_ends(study, problem, Path(folder), arguments.trials)

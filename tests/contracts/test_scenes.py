@@ -58,7 +58,7 @@ def test_a_small_scene_runs_within_its_box_and_says_what_it_has(name, generator)
     assert any(scene.box.periodic) == scene.features["periodic"]
     assert state.velocities[fluid].norm(dim=1).max() < 0.3 * scene.equation_of_state.sound_speed
     assert ((state.densities[fluid] / scene.rest_density - 1).abs() < 0.1).all()
-    if scene.has_force:
+    if scene.force is not None:
         force = scene.force(state.positions)
         assert force.shape == state.positions.shape
         assert float(force.norm(dim=1).max()) == pytest.approx(scene.largest_force)
@@ -112,10 +112,8 @@ def test_a_scene_becomes_a_data_set_that_says_what_it_is(scene, dataset):
     assert dataset.scene.velocity_source == dataset.scene.mass_source == "stored"
     assert dataset.scene.has_boundary == scene.features["walls"]
     assert dataset.scene.frame_dt == pytest.approx(scene.frame_dt)
-    assert dataset.scene.force == scene.gravity
-    assert any(line.startswith("force:") for line in dataset.scene.missing) == (
-        scene.has_force and scene.gravity is None
-    )
+    assert dataset.scene.force == scene.force
+    assert not dataset.scene.missing
     trajectory = dataset.trajectory("test", 0)
     assert (trajectory.viscosities is not None) == scene.features["varying_viscosity"]
     assert torch.isfinite(trajectory.velocities).all()

@@ -9,6 +9,7 @@ from particle_files import FRAME_DT, encode, record_frames, walls, write_packed,
 from cconv.data.dataset import open_dataset
 from cconv.data.deep_lagrangian_fluids import decode_array
 from cconv.errors import DataError
+from cconv.forces import ConstantForce
 
 
 def read_all(folder, **given):
@@ -110,7 +111,7 @@ def test_what_is_given_wins_and_is_no_longer_missing(tmp_path):
     assert trajectory.masses.tolist() == [0.5] * 5
     assert dataset.scene.particle_spacing == 0.1
     assert dataset.scene.frame_dt == 0.5
-    assert dataset.scene.force == (0.0, -9.81, 0.0)
+    assert dataset.scene.force == ConstantForce((0.0, -9.81, 0.0))
     assert dataset.scene.missing == ()
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -11,6 +12,7 @@ from cconv.data.dataset import open_dataset
 from cconv.data.hdf5 import write_dataset
 from cconv.data.trajectory import finite_difference_velocities
 from cconv.errors import ConfigError, DataError
+from cconv.forces import ConstantForce, ReversePoiseuilleForce
 
 SPLITS = ("train", "valid", "test")
 
@@ -89,15 +91,31 @@ def test_wall_particles_are_the_boundary(tmp_path):
 
 def test_dam_break_has_gravity(tmp_path):
     write_hdf5(tmp_path, {"case": "DB", "g_ext_magnitude": 1.5})
-    assert open_dataset(tmp_path).scene.force == (0.0, -1.5)
+    assert open_dataset(tmp_path).scene.force == ConstantForce((0.0, -1.5))
 
 
-def test_position_dependent_force_is_named_and_its_code_not_run(tmp_path):
-    write_hdf5(tmp_path, {"case": "RPF", "g_ext_magnitude": 1.0})
+@pytest.mark.parametrize(("case", "force"), [("RPF", ReversePoiseuilleForce(1.5, 2.0)), ("other", None)])
+def test_a_force_is_known_by_its_case_and_code_beside_the_data_not_run(tmp_path, case, force):
+    write_hdf5(tmp_path, {"case": case, "g_ext_magnitude": 1.5, "bounds": [[0.0, 1.0], [0.0, 2.0]]})
     (tmp_path / "force.py").write_text("raise SystemExit('code found in data was run')")
     scene = open_dataset(tmp_path).scene
-    assert scene.force is None
-    assert any(line.startswith("force:") for line in scene.missing)
+    assert scene.force == force
+    assert any(line.startswith("force:") for line in scene.missing) == (force is None)
+
+
+@pytest.mark.parametrize("force", [ConstantForce((0.5, -1.0)), ReversePoiseuilleForce(1.5, 2.0)])
+def test_a_force_is_declared_by_name_and_read_again(tmp_path, force):
+    write_hdf5(tmp_path / "a")
+    dataset = open_dataset(tmp_path / "a")
+    write_dataset(
+        tmp_path / "b",
+        replace(dataset.scene, force=force),
+        {split: dataset.trajectories(split) for split in dataset.splits},
+    )
+    stored = json.loads((tmp_path / "b" / "metadata.json").read_text())
+    assert stored["cconv"]["force"]["name"] == force.name
+    assert stored["g_ext_magnitude"] == force.largest
+    assert open_dataset(tmp_path / "b").scene.force == force
 
 
 def test_what_is_given_wins(tmp_path):
@@ -105,7 +123,7 @@ def test_what_is_given_wins(tmp_path):
     dataset = open_dataset(tmp_path, mass=2.0, particle_spacing=0.5, frame_dt=0.25, force=(1.0, 0.0))
     scene = dataset.scene
     assert dataset.trajectory("train", 0).masses.tolist() == [2.0] * 4
-    assert (scene.particle_spacing, scene.frame_dt, scene.force) == (0.5, 0.25, (1.0, 0.0))
+    assert (scene.particle_spacing, scene.frame_dt, scene.force) == (0.5, 0.25, ConstantForce((1.0, 0.0)))
     assert scene.mass_source == "given: 2"
 
 

@@ -6,6 +6,7 @@ import pytest
 from particle_files import record_frames, write_parts
 
 from cconv.errors import ConfigError
+from cconv.forces import ConstantForce
 from cconv.study.running.problem import open_card_data
 
 
@@ -33,7 +34,7 @@ def test_the_card_speaks_for_the_data_of_its_model(folders):
     card = card_of(folders / "own")
     for path in (None, str(folders / "own"), str(folders / "other" / ".." / "own")):
         dataset, is_own = open_card_data(card, path)
-        assert (facts(dataset), is_own) == ((0.2, 0.5, 0.01, (0, -1, 0)), True)
+        assert (facts(dataset), is_own) == ((0.2, 0.5, 0.01, ConstantForce((0, -1, 0))), True)
 
 
 def test_a_copy_of_the_data_is_known_by_its_content(folders):
@@ -64,4 +65,4 @@ def test_other_data_speak_for_themselves(folders):
 
 def test_what_the_user_says_wins(folders):
     dataset, _ = open_card_data(card_of(folders / "own"), None, {"mass": 0.75, "force": None})
-    assert facts(dataset) == (0.2, 0.75, 0.01, (0, -1, 0))
+    assert facts(dataset) == (0.2, 0.75, 0.01, ConstantForce((0, -1, 0)))

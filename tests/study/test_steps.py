@@ -33,7 +33,17 @@ def test_a_scene_without_walls_and_force_has_no_input_for_them(run):
     for entry in run.summary().finalists:
         config = json.loads((run.path / entry.checkpoint / "config.json").read_text())
         assert not {"force", "particle_type"} & set(config["features"])
-        assert config["history"] == 3
+
+
+def test_models_of_all_histories_are_compared_at_the_same_presents(run, cconv):
+    """So that an error can be computed again from the checkpoint alone."""
+    for entry in run.summary().finalists:
+        card = json.loads((run.path / entry.checkpoint / "card.json").read_text())
+        config = json.loads((run.path / entry.checkpoint / "config.json").read_text())
+        assert (card["window"], config["history"]) == (6, card["parameters"].get("task.history"))
+        code, printed, _ = cconv("evaluate", run.path / entry.checkpoint, "--split", "valid", "--json")
+        assert code == 0
+        assert json.loads(printed)["rollout_mse"] == pytest.approx(card["valid_error"], rel=1e-3)
 
 
 def test_the_report_speaks_of_rollouts(run):

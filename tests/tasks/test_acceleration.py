@@ -8,6 +8,7 @@ from systems import periodic_frame, periodic_scene, window_of, with_walls
 
 from cconv.data.trajectory import ParticleType
 from cconv.errors import ConfigError, ShapeError
+from cconv.forces import ConstantForce, ReversePoiseuilleForce
 from cconv.nn.kinds import Kinds
 from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples, make_step_sample
@@ -41,7 +42,7 @@ def test_velocity_and_accelerations_are_the_history_newest_first(generator):
     expected = steps.diff(dim=0).flip(0).transpose(0, 1)
     torch.testing.assert_close(column(features, "accelerations").double(), expected, rtol=1e-4, atol=1e-5)
     assert features.vector_names[-1] == "velocity"  # networks that know it as differences leave out the last vector
-    assert features.kinds == TASK.kinds(TASK.features) == Kinds(3, 6)
+    assert features.kinds == TASK.kinds(TASK.features) == Kinds(4, 7)
 
 
 def test_a_uniform_motion_leaves_everything_but_the_velocity(generator):
@@ -80,7 +81,7 @@ def test_boundary_points_are_walls_where_no_particle_is_one(generator):
 
 
 def test_a_force_is_in_spacings_per_frame_squared(generator):
-    scene = replace(periodic_scene(), force=(0.0, -9.81))
+    scene = replace(periodic_scene(), force=ConstantForce((0.0, -9.81)))
     inputs = TASK.inputs(window_of(periodic_frame(generator), generator), scene, TASK.features)
     expected = torch.tensor([0.0, -9.81 * scene.frame_dt**2 / scene.particle_spacing])
     torch.testing.assert_close(column(inputs.features, "force")[:, 0], expected.expand(64, 2))
@@ -111,3 +112,13 @@ def test_samples_are_made_when_asked_for(generator):
     assert len(samples) == 3
     assert torch.equal(samples[2].target, make_step_sample(windows[2], periodic_scene(), TASK).target)
     assert [sample.window for sample in samples[1:]] == windows[1:]
+
+
+def test_a_force_that_depends_on_the_place_is_that_of_each_particle(generator):
+    window, scene = window_of(periodic_frame(generator), generator), periodic_scene()
+    scene = replace(scene, force=ReversePoiseuilleForce(2.0, 1.0))
+    forces = column(TASK.inputs(window, scene, TASK.features).features, "force")[:, 0]
+    signs = torch.where(window.present[:, 1] % 1.0 > 0.5, -1.0, 1.0)
+    assert {-1.0, 1.0} == set(signs.tolist())
+    expected = torch.stack([2.0 * signs * scene.frame_dt**2 / scene.particle_spacing, torch.zeros(64)], dim=1)
+    torch.testing.assert_close(forces, expected)

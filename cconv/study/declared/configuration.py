@@ -20,11 +20,13 @@ MOST_UNROLLED = 10  # steps that an update differentiates through, whose states 
 MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns from
 STILL = {"noise": 0.0, "pushforward": 0, "unroll": 1}  # settings of a training, with which no particle is moved
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
+HISTORY = "task.history"
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
 _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
 HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
+    HISTORY,
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
     *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
@@ -83,6 +85,11 @@ class TaskConfig(StrictModel):
         known = TASKS[self.name].features
         return known if self.features is None else tuple(name for name in known if name in (CONSTANT, *self.features))
 
+    @property
+    def usual_history(self) -> int:
+        """Frames that an answer depends on where no hyperparameter says otherwise."""
+        return TASKS[self.name].history if self.history is None else self.history
+
 
 class TrainingConfig(StrictModel):
     """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
@@ -120,16 +127,18 @@ class Configuration(NamedTuple):
 
     Attributes:
         features: Names of the features that the network is given.
+        history: Frames that an answer depends on, the present one among them.
         network: Network settings.
         training: Training settings.
     """
 
     features: tuple[str, ...]
+    history: int
     network: NetworkSettings
     training: TrainingConfig
 
 
-DEFAULTS = Configuration(TASKS["density_rate"].features, ConvNetSettings(), TrainingConfig())
+DEFAULTS = Configuration(TASKS["density_rate"].features, 1, ConvNetSettings(), TrainingConfig())
 
 
 def known_hyperparameters(name: str) -> str:
@@ -162,13 +171,14 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
     kept = {name: value for name, value in defaults.network.model_dump().items() if name in settings.model_fields}
     return Configuration(
         tuple(name for name in features if taken.get(name, True)),
+        _history(parameters, defaults),
         _possible(settings, NETWORK, kept | drawn),
         _possible(TrainingConfig, TRAINING, defaults.training.model_dump() | below(TRAINING, parameters)),
     )
 
 
 def check_asked(configuration: Configuration, task: str) -> None:
-    """Check that a configuration has no features of another task, and changes windows only where there are some.
+    """Check that a configuration has features and a history of the task, and changes windows only where there are some.
 
     Raises:
         ConfigError: With the setting.
@@ -176,6 +186,10 @@ def check_asked(configuration: Configuration, task: str) -> None:
     foreign = [name for name in configuration.features if name not in TASKS[task].features]
     if foreign:
         raise ConfigError(f"not possible ({feature_path(foreign[0])}: is no feature of the task {task!r})")
+    try:
+        TASKS[task].check_history(configuration.history)
+    except ConfigError as error:
+        raise ConfigError(f"not possible ({HISTORY}: {error})") from error
     for name, value in configuration.training.moving.items():
         if not issubclass(TASKS[task], StepTask):
             allowed = f"must be {STILL[name]:g} for the field {task!r}"
@@ -209,6 +223,14 @@ def _architecture(parameters: Mapping[str, Value], defaults: Configuration) -> s
     if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
         raise ConfigError(f"not possible ({ARCHITECTURE}: must be one of {', '.join(ARCHITECTURES)})")
     return architecture
+
+
+def _history(parameters: Mapping[str, Value], defaults: Configuration) -> int:
+    """The history that is drawn, or the study's own."""
+    history = parameters.get(HISTORY, defaults.history)
+    if not isinstance(history, int) or isinstance(history, bool):
+        raise ConfigError(f"not possible ({HISTORY}: must be a whole number, got {shown(history)})")
+    return history
 
 
 def _check_features(parameters: Mapping[str, Value]) -> None:

@@ -12,6 +12,7 @@ from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import (
     ARCHITECTURE,
     DEFAULTS,
+    HISTORY,
     HYPERPARAMETERS,
     NETWORK,
     Configuration,
@@ -20,6 +21,7 @@ from cconv.study.declared.configuration import (
 )
 from cconv.study.declared.domains import SearchSpace, Value
 from cconv.study.declared.paths import below
+from cconv.study.declared.stage import included
 from cconv.study.declared.study_file import StudyConfig
 from cconv.validation import validated
 
@@ -60,6 +62,14 @@ def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | 
             _check_configures(values, configured, f"{source}: `parameters.{name}`: the value {shown(value)}")
     _check_conditions_on_architectures(space, source)
     _check_configures(space.baseline, configured, f"{source}: the baseline")
+
+
+def longest_history(space: SearchSpace, study: StudyConfig) -> int:
+    """The longest history of all configurations of a study, so that their windows can have the same presents."""
+    drawn = space.parameters[HISTORY].extremes if HISTORY in space.parameters else []
+    named = [parameters.get(HISTORY) for _, parameters in included(study.stages)]
+    histories = [study.task.usual_history, *drawn, *named]
+    return max(history for history in histories if isinstance(history, int))
 
 
 def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -> None:

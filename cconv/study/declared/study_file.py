@@ -181,7 +181,7 @@ class StudyConfig(StrictModel):
     @property
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
-        return Configuration(self.task.taken, self.network, self.training)
+        return Configuration(self.task.taken, self.task.usual_history, self.network, self.training)
 
     def configured(self, parameters: Mapping[str, Value]) -> Configuration:
         """What a trial has for which these hyperparameters are drawn.

@@ -39,7 +39,7 @@ class CostCounter:
         configuration = configure(parameters, self._study.configuration)
         features, network = self._problem.features_of(configuration), configuration.network
         return network.count(
-            self._problem.task.kinds(features),
+            self._problem.task_of(configuration).kinds(features),
             self._inputs.wall_kinds if WALLS in features else None,
             self._problem.task.output,
             self._problem.scene.dim,

@@ -1,7 +1,7 @@
 """The problem that all trials of a study share: the scene, the task and its samples."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
-from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TaskConfig, TrainingConfig
+from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
+from cconv.tasks.features import features_in
 from cconv.tasks.samples import HORIZON, Sample, WindowSamples, iterate_samples, learned_samples, rolled_samples
 from cconv.tasks.task import StepTask, Task, as_field
 from cconv.training.augmentation import RandomWalkNoise
@@ -33,9 +34,11 @@ Progress = Callable[[Iterable, str], Iterable]
 class Problem:
     """Scene, task and samples of a study.
 
+    Models may differ in the history that their answers depend on. All are trained and compared at the same presents.
+
     Attributes:
         scene: Scene of all trajectories.
-        task: Task of the models.
+        task: Task of the models, with the longest history of any of them.
         train_samples: Frames of the training split; features and targets are standardised by them.
         valid_samples: Frames of the validation split, by whose error the search compares models.
     """
@@ -53,26 +56,47 @@ class Problem:
     @property
     def typical_samples(self) -> Sequence[Sample]:
         """Training samples whose means and variances are those of all: all of them, or windows spread over them."""
-        return self.train_samples.spread if isinstance(self.train_samples, WindowSamples) else self.train_samples
+        return self._typical(self.task.history)
+
+    def task_of(self, configuration: Configuration) -> Task:
+        """Task of the models of a configuration, with its history."""
+        return replace(self.task, history=configuration.history)
+
+    def _typical(self, history: int) -> Sequence[Sample]:
+        samples = self._training_samples(history)
+        return samples.spread if isinstance(samples, WindowSamples) else samples
+
+    def _training_samples(self, history: int) -> Sequence[Sample]:
+        """Training samples of models with some history; those of each are made once."""
+        if not isinstance(self.train_samples, WindowSamples):
+            return self.train_samples
+        if history not in self._of_history:
+            self._of_history[history] = self.train_samples.of_history(history)
+        return self._of_history[history]
+
+    @cached_property
+    def _of_history(self) -> dict[int, WindowSamples]:
+        return {}
 
     def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
         """Compute the error of a model on the validation split; without a cache all geometries are computed anew."""
         return self.objective.error(model, self.valid_samples, geometry)
 
-    def examples(self, training: TrainingConfig, seed: int) -> Examples:
-        """Make the examples of a training, with its noise and pushforward.
+    def examples(self, training: TrainingConfig, seed: int, history: int) -> Examples:
+        """Make the examples of a training, with its noise and pushforward, of a model with some history.
 
         Raises:
             ConfigError: If one of them is asked for where there are no windows.
         """
+        samples = self._training_samples(history)
         if not training.moving:
-            return StoredExamples(self.train_samples)
-        if not isinstance(self.train_samples, WindowSamples):
+            return StoredExamples(samples)
+        if not isinstance(samples, WindowSamples):
             settings = ", ".join(f"`training.{name}` = {value:g}" for name, value in training.moving.items())
             raise ConfigError(f"{settings}: not possible for the field {self.task.name!r}, which has no windows.")
         begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
         pushforward = Pushforward(training.pushforward, begins)
-        return AugmentedExamples(self.train_samples, RandomWalkNoise(training.noise), pushforward, seed)
+        return AugmentedExamples(samples, RandomWalkNoise(training.noise), pushforward, seed)
 
     def solve_closed_form(
         self, model: Model, training: TrainingConfig, places: Iterable[int], ridge: float, seed: int
@@ -81,7 +105,7 @@ class Problem:
 
         With noise, each place gives one noisy example; the loss says how much each frame counts.
         """
-        examples = self.examples(training, seed)
+        examples = self.examples(training, seed, model.task.history)
         drawn = (examples.draw(place, 0, model) for place in places)
         solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
 
@@ -93,16 +117,17 @@ class Problem:
 
     def features_of(self, configuration: Configuration) -> tuple[str, ...]:
         """Features that a network of a configuration is given in this scene."""
-        return tuple(name for name in configuration.features if name in self.present_features)
+        present = tuple(name for name in configuration.features if name in self.present_features)
+        return features_in(present, configuration.history)
 
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """Build an untrained model with the initial weights of `init_seed`."""
         return build_model(
             configuration.network,
-            self.task,
+            self.task_of(configuration),
             self.features_of(configuration),
             self.scene,
-            self.typical_samples,
+            self._typical(configuration.history),
             torch.Generator().manual_seed(init_seed),
         )
 
@@ -139,17 +164,17 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
 
 
 def study_samples(
-    study: StudyConfig, dataset: Dataset, split: str, progress: Progress = lambda items, _: items
+    study: StudyConfig, dataset: Dataset, split: str, task: Task, progress: Progress = lambda items, _: items
 ) -> Sequence[Sample]:
-    """Make the samples of a split for the task of a study, of the training split those to learn from.
+    """Make the samples of a split for a study, of the training split those to learn from.
 
     Args:
         study: The study.
         dataset: Its data.
         split: "train", "valid" or "test".
+        task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
     """
-    task = study_task(study.task, dataset.scene)
     if not isinstance(task, StepTask):
         return list(progress(iterate_samples(dataset, split, as_field(task)), split))
     if split == "train":
@@ -162,40 +187,43 @@ def _horizon(study: StudyConfig) -> int:
     return study.task.horizon or HORIZON
 
 
-def check_test_split(study: StudyConfig, dataset: Dataset) -> None:
+def check_test_split(study: StudyConfig, dataset: Dataset, task: Task) -> None:
     """Check that the test split, which is read at the end alone, has frames enough for the rollouts of a step task.
 
     Raises:
         DataError: With the trajectory that has too few.
     """
-    task = study_task(study.task, dataset.scene)
     if isinstance(task, StepTask):
         for block in dataset.splits["test"]:
             check_length(block.trajectory, dataset.num_frames(block), task.history, _horizon(study))
 
 
-def study_task(task: TaskConfig, scene: Scene) -> Task:
-    """Make the task of a study for its scene."""
-    length = task.smoothing_length
+def study_task(study: StudyConfig, scene: Scene, history: int | None = None) -> Task:
+    """Make the task of a study for its scene.
+
+    Args:
+        study: The study.
+        scene: Scene of its data.
+        history: Longest history of its models; None for the study's own.
+    """
+    length = study.task.smoothing_length
     relative = 1.0 if length is None else length / scene.particle_spacing
-    return task_named(task.name, task.kernel, relative, task.history)
+    return task_named(study.task.name, study.task.kernel, relative, history or study.task.history)
 
 
-def load_problem(study: StudyConfig, dataset: Dataset, progress: Progress = lambda items, _: items) -> Problem:
+def load_problem(
+    study: StudyConfig, dataset: Dataset, task: Task, progress: Progress = lambda items, _: items
+) -> Problem:
     """Load the training and validation samples of a study; the test split is not read.
 
     Args:
         study: The study.
         dataset: Its data.
+        task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
     """
-    train, valid = (study_samples(study, dataset, split, progress) for split in ("train", "valid"))
-    return Problem(
-        scene=dataset.scene,
-        task=study_task(study.task, dataset.scene),
-        train_samples=train,
-        valid_samples=valid,
-    )
+    train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
+    return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
 
 
 def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:

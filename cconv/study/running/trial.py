@@ -67,7 +67,7 @@ def run_trial(
     best = _best_so_far(folder)
     states = train(
         model,
-        problem.examples(training, trial.data_seed),
+        problem.examples(training, trial.data_seed, configuration.history),
         problem.valid_error,
         Optimization(**training.model_dump(include={field.name for field in fields(Optimization)})),
         data_seed=trial.data_seed,
@@ -101,6 +101,7 @@ def describe(problem: Problem, trial: Trial, model: Model, training: TrainingCon
         "stage": trial.stage,
         "parameters": dict(trial.parameters),
         "features": list(model.config.features),
+        "window": problem.task.history,
         "network": model.settings.model_dump(),
         "training": training.model_dump(),
         "init_seed": trial.init_seed,

@@ -109,8 +109,8 @@ def toggled(session: Session, best: Retrained) -> dict[str, dict]:
     """Return the hyperparameters of the best finalist with one optional feature of the scene toggled, by feature."""
     parameters = best.records[0].parameters
     features = configure(parameters, session.study.configuration).features
-    optional = session.problem.task.optional
-    offered = [name for name in optional if name != WALLS or session.problem.scene.has_boundary]
+    optional, present = session.problem.task.optional, session.problem.present_features
+    offered = [name for name in optional if name in present and (name != WALLS or session.problem.scene.has_boundary)]
     return {name: parameters | {feature_path(name): name not in features} for name in offered}
 
 

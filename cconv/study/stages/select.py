@@ -88,7 +88,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
     check_any_finished(run, finalists, failed)
     judged = _judge(session, finalists)
     growth = _growth(session, finalists)
-    samples = study_samples(study, session.dataset, "test", session.progress)
+    samples = study_samples(study, session.dataset, "test", session.problem.task, session.progress)
     tests, test_errors = _errors(session, finalists, samples, "test errors")
     is_field = isinstance(session.problem.task, FieldTask)
     explained = [each for each in finalists if is_field and each.id in (BASELINE, judged.chosen.id)]

@@ -8,7 +8,7 @@ from cconv.networks import RadialNetSettings
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
-from cconv.study.declared.search_space import check_baseline_affordable, load_space
+from cconv.study.declared.search_space import check_baseline_affordable, load_space, longest_history
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
 from cconv.study.studies import load_study
 
@@ -310,6 +310,7 @@ def test_a_space_is_checked_with_the_settings_of_its_study(space_file):
             "0.0",
             r"the value 0\.1 is not possible .training\.noise: must be 0 for the field",
         ),
+        ("task.history", "[2, 3]", "3", "the value 2 is not possible .task.history: .* must be 1 for the task"),
         ("training.pushforward", "[0, 3]", "0", "the value 3 is not possible .*must be 0 for the field"),
         ("task.features.force", "[true, false]", "false", "the value True is not possible .*no feature of the task"),
     ],
@@ -320,6 +321,29 @@ def test_what_only_steps_have_is_refused_in_the_space_of_a_field(name, values, b
     with pytest.raises(ConfigError, match=message):
         load_space(path, load_study(REPOSITORY / "experiments" / "smoke.toml"))
     load_space(path, load_study(REPOSITORY / "experiments" / "rollout.toml"))
+
+
+@pytest.mark.parametrize("values", ["[2, true]", '[2, "3"]', "[2, 2.5]", "[2, 21]", "[1, 2]"])
+def test_a_history_that_steps_cannot_have_is_refused(values, space_file):
+    path = space_file(f'[parameters.task.history]\ntype = "choice"\nvalues = {values}\nbaseline = 2\nreason = "r"\n')
+    with pytest.raises(ConfigError, match=r"the value .* is not possible .task\.history: "):
+        load_space(path, load_study(REPOSITORY / "experiments" / "rollout.toml"))
+
+
+@pytest.mark.parametrize(
+    ("domain", "own", "longest"),
+    [
+        ('type = "choice"\nvalues = [2, 5]\nbaseline = 2', 3, 5),
+        ('type = "int"\nrange = [2, 7]\nbaseline = 2', 3, 7),
+        ('type = "choice"\nvalues = [2, 5]\nbaseline = 2', 8, 8),
+    ],
+)
+def test_the_longest_history_is_that_of_any_configuration(domain, own, longest, space_file):
+    study = load_study(REPOSITORY / "experiments" / "rollout.toml", [f"task.history={own}"])
+    space = load_space(space_file(f'[parameters.task.history]\n{domain}\nreason = "r"\n'), study)
+    assert longest_history(space, study) == longest
+    assert study.configured({"task.history": 2}).history == 2
+    assert study.configured({}).history == own
 
 
 def test_layers_of_a_huge_space_are_drawn_without_listing_them():
