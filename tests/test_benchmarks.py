@@ -68,6 +68,36 @@ def test_the_benchmark_of_predictions_compares_two_states_measures_growth_and_dr
     assert (out / "inference.png").is_file()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
+def test_the_benchmark_of_rollouts_measures_time_and_memory(tmp_path):
+    printed = run("rollout", "--out", tmp_path)
+    results = json.loads((tmp_path / "rollout.json").read_text())
+    assert [row["num_particles"] for row in results["frames"]] == [400, 900]
+    for row in results["frames"]:
+        assert all(0 < row[time]["low"] <= row[time]["median"] <= row[time]["high"] for time in ("cpu_ms", "ms"))
+        assert row["added_mb"] > 0
+    assert results["growth"].keys() == {"cpu_ms exponent", "ms exponent", "kb per particle", "mb besides"}
+    assert json.dumps(results["growth"]) in printed
+
+
+def test_growth_is_that_of_times_and_memory_that_are_known(benchmark_script):
+    particles = [1000, 3000, 10_000]
+    rows = [{"cpu_ms": {"median": 2 * n**1.1}, "ms": {"median": n**0.9}, "added_mb": 20 + 0.004 * n} for n in particles]
+    found = benchmark_script("rollout").growth(particles, rows)
+    assert list(found.values()) == pytest.approx([1.1, 0.9, 4.0, 20.0])
+
+
+def test_what_is_rolled_out_is_periodic_vortices_at_rest_in_the_mean(benchmark_script):
+    window, scene = benchmark_script("rollout").vortices(400, 6)
+    displacements = window.displacements(scene.box, 6)
+    assert window.positions.shape == (6, 400, 2)
+    assert window.future.shape == (1, 400, 2)
+    assert scene.box.wrap(window.positions).equal(window.positions)
+    assert displacements.norm(dim=-1).max() <= 0.3 * scene.particle_spacing * (1 + 1e-9)
+    assert displacements.mean(dim=1).abs().max() < 0.01 * displacements.abs().max()
+
+
 def test_quartiles_of_few_times_stay_among_them(benchmark_script):
     """Quartiles that extrapolate gave a ratio of two times below zero."""
     found = benchmark_script("inference").quartiles([0.2, 3.0])

@@ -49,13 +49,13 @@ def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame | Window, scene: 
 def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame | Window, scene: Scene, threads: int) -> None:
     torch.set_num_threads(threads)
     model = load(path)
-    before = _peak_resident_megabytes()
+    before = peak_resident_megabytes()
     for _ in range(2):
         model.predict_frame(frame, scene)
-    sender.send(_peak_resident_megabytes() - before)
+    sender.send(peak_resident_megabytes() - before)
 
 
-def _peak_resident_megabytes() -> float:
+def peak_resident_megabytes() -> float:
     """Return the peak memory of this process; on Linux from /proc, as `getrusage` would return the parent's peak."""
     status = Path("/proc/self/status")
     if not status.is_file():

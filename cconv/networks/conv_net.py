@@ -286,7 +286,7 @@ class ConvNetSettings(ConvolutionSettings):
         sizes = conv.inputs.scalars, conv.outputs.scalars, self.kernel_size**dim, corners
         return count_filters(*sizes, conv.pairs.senders, conv.pairs.neighbors, pair)
 
-    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
+    def _geometry_arrays(self, dim: int) -> int:
         """Arrays of all pairs from displacements to cells, fractions and weights, as `nn.filters` makes them."""
         mapped = {
             "identity": 0,

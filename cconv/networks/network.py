@@ -277,7 +277,7 @@ class ConvolutionSettings(NetworkSettings):
         return total(
             [
                 *(self._count_conv(conv, dim) for conv in convs),
-                *(count_arrays(self._geometry_arrays(dim, pairs, convs), pairs) for pairs in searched),
+                *(count_arrays(self._geometry_arrays(dim), pairs) for pairs in searched),
                 *(count_search(pairs, dim) for pairs in searched),
                 *(count_linear(before, after, dim) for before, after in maps),
             ]
@@ -294,8 +294,8 @@ class ConvolutionSettings(NetworkSettings):
         """Cost of a convolution."""
 
     @abstractmethod
-    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
-        """How many arrays of all pairs the geometry takes, for these convolutions."""
+    def _geometry_arrays(self, dim: int) -> int:
+        """How many arrays of all pairs the geometry takes."""
 
     def sent(self, inputs: Kinds) -> Kinds:
         """Return the features that particles send to each other; the constant is left out if they send differences."""

@@ -19,8 +19,6 @@ from cconv.networks.counting import (
     CountedConv,
     CountedCost,
     Pairs,
-    count_filters,
-    total,
     window_arrays,
 )
 from cconv.networks.network import (
@@ -37,7 +35,7 @@ from cconv.networks.network import (
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.nn.radial_conv import RadialConv, RadialGeometry
 from cconv.ops.convolution import columns
-from cconv.ops.radial import MOST_OUTPUTS
+from cconv.ops.radial import MOST_READS, num_reads
 from cconv.validation import Flag, Whole
 
 
@@ -298,25 +296,28 @@ class RadialNetSettings(ConvolutionSettings):
         return own if self.message in ("absolute", "difference") else Kinds(own.scalars, max(0, own.vectors - 1))
 
     def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
-        """Pairs read the filters of all outputs themselves where these are few; else messages are written down."""
+        """Pairs read filters themselves where these are few; else messages are gathered into columns of terms."""
         (scalars, vectors), (to_scalars, to_vectors), neighbors = conv.inputs, conv.outputs, conv.pairs.neighbors
-        of_scalars, of_vectors, components = scalars + vectors, scalars + 2 * vectors, scalars + dim * vectors
-        if max(conv.outputs) <= MOST_OUTPUTS:
-            reads = of_scalars * to_scalars + (of_scalars + dim * vectors) * to_vectors
+        reads = num_reads(conv.inputs, conv.outputs, dim)
+        if reads <= MOST_READS:
             # Two values and a message of each read; projections, directions.
-            flops = 2.0 * (3 * reads + dim * vectors + dim * to_vectors)
-            moved = 2 * INDEX + (dim + 1 + components + reads) * FLOAT
-            added = (to_scalars + dim * to_vectors) * ARRAY
-            return CountedCost(flops_per_particle=neighbors * flops, bytes_per_particle=neighbors * moved + added)
-        messages = neighbors * ARRAY * (4 * components + 2 * of_scalars + 4 * dim * of_vectors)
-        shape = self.radial_terms, min(2, self.radial_terms), neighbors, neighbors, INDEX + 3 * FLOAT
-        of_each_axis = [count_filters(of_vectors, to_vectors, *shape)] * (dim if to_vectors else 0)
-        written = CountedCost(bytes_per_particle=messages)
-        return total([written, count_filters(of_scalars, to_scalars, *shape), *of_each_axis])
+            of_pair, of_particle = 3 * reads + dim * vectors + dim * to_vectors, 0
+            moved = reads * FLOAT
+        else:
+            of_scalars = (scalars + vectors) * (to_scalars > 0)
+            of_vectors = dim * (scalars + 2 * vectors) * (to_vectors > 0)
+            columns = of_scalars + of_vectors
+            # Projections; messages at the two terms around a pair; then columns times filters.
+            of_pair = dim * vectors + 2 * columns
+            of_particle = self.radial_terms * (of_scalars * to_scalars + of_vectors * to_vectors)
+            moved = 2 * columns * ARRAY
+        moved += 2 * INDEX + (dim + 1 + conv.inputs.num_values(dim)) * FLOAT
+        return CountedCost(
+            flops_per_particle=2.0 * (neighbors * of_pair + of_particle),
+            bytes_per_particle=neighbors * moved + conv.outputs.num_values(dim) * ARRAY,
+        )
 
-    def _geometry_arrays(self, dim: int, pairs: Pairs, convs: Sequence[CountedConv]) -> int:
-        """Arrays of all pairs: the window, and terms and directions where a convolution takes messages of each."""
+    def _geometry_arrays(self, dim: int) -> int:
+        """Arrays of all pairs: the window, where there is one."""
         weighted = self.window != "none" or self.normalize
-        arrays = window_arrays(self.window, self.normalize) if weighted else 0
-        written = any(max(conv.outputs) > MOST_OUTPUTS for conv in convs if conv.pairs is pairs)
-        return arrays + (3 * dim + 12 if written else 0)
+        return window_arrays(self.window, self.normalize) if weighted else 0

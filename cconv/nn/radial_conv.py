@@ -219,10 +219,9 @@ class RadialConv(nn.Module):
         """`forward` without its checks, for hidden layers."""
         filters = self.scalar_filters, self.vector_filters
         own = MESSAGES[self.message]
-        differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (features, *filters))
         if radial.applies(features, *filters, geometry.edges):
             output = radial.convolve(features, *filters, geometry.edges, geometry.weights, own)
-        elif differentiated and radial_columns.applies(features, geometry.weighted_edges):
+        elif radial_columns.applies(features, geometry.weighted_edges):
             general = partial(self._convolve_generally, geometry=geometry)
             output = radial_columns.convolve(features, *filters, geometry.weighted_edges, own, general)
         else:

@@ -1,7 +1,8 @@
 """Radial convolution in compiled loops over a few hundred edges at a time, without arrays as large as all edges.
 
-It runs on the CPU in float32 and float64 and is not differentiable. Each edge reads the filters of all outputs, so it
-is fast only for few outputs. Compiled as in `gathers`, but that sums may also change their order.
+It runs on the CPU in float32 and float64 and is not differentiable. Each edge reads the filters of all inputs and
+outputs, so it is fast only where these are few; else `radial_columns` is. Compiled as in `gathers`, but that sums may
+also change their order.
 """
 
 import numpy as np
@@ -17,19 +18,25 @@ from cconv.ops.workers import run_on_workers, runs_compiled
 _compile = compile_cached(nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 
 EDGES_AT_A_TIME = 512  # number of edges at a time: their values fit the innermost cache
-MOST_OUTPUTS = 20  # largest number of outputs of a kind: for more, gathering messages and a matrix product are faster
+MOST_READS = 64  # largest number of filters that an edge reads: for more, columns and a matrix product are faster
 _READS_PER_WORKER = 2**19  # fewer cost less than waking a thread
 
 
+def num_reads(inputs: tuple[int, int], outputs: tuple[int, int], dim: int) -> int:
+    """Number of filters that an edge reads, from numbers of scalars and vectors; filters of vectors count D times."""
+    (scalars, vectors), (to_scalars, to_vectors) = inputs, outputs
+    directed = scalars + vectors
+    return directed * to_scalars + (directed + dim * vectors) * to_vectors
+
+
 def applies(features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, edges: Edges) -> bool:
-    """Tell whether `convolve` can be used and is fast: nothing to differentiate, few outputs, the CPU."""
+    """Tell whether `convolve` can be used and is fast: nothing to differentiate, few reads, the CPU."""
     tensors = (features, scalar_filters, vector_filters, edges.displacements)
     differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return (
-        not differentiated
-        and max(scalar_filters.shape[2], vector_filters.shape[2]) <= MOST_OUTPUTS
-        and runs_compiled(features)
-    )
+    (_, directed, to_scalars), (_, of_vectors, to_vectors) = scalar_filters.shape, vector_filters.shape
+    vectors = of_vectors - directed
+    reads = num_reads((directed - vectors, vectors), (to_scalars, to_vectors), edges.dim)
+    return not differentiated and reads <= MOST_READS and runs_compiled(features)
 
 
 def convolve(

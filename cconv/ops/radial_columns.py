@@ -59,7 +59,7 @@ def applies(features: Tensor, weighted: WeightedEdges) -> bool:
     """Tell whether `convolve` can be used: on the CPU, where positions are not differentiated."""
     positions = (weighted.edges.displacements, weighted.weights)
     moved = any(tensor is not None and tensor.requires_grad for tensor in positions)
-    return not moved and runs_compiled(features)
+    return not (moved and torch.is_grad_enabled()) and runs_compiled(features)
 
 
 def convolve(

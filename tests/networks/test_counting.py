@@ -10,6 +10,7 @@ from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import NeighborDensity, ball_volume
 from cconv.nn import ContinuousConv
 from cconv.nn.kinds import Kinds
+from cconv.ops import radial
 from cconv.tasks import task_named
 from cconv.tasks.features import kinds_of
 from cconv.tasks.samples import make_sample
@@ -52,13 +53,16 @@ def counted_on(model, inputs):
 def of_conv(conv, geometry):
     if isinstance(conv, ContinuousConv):
         return of_reads(conv.filters.flatten(0, -3), geometry.reads)
-    if max(conv.out_channels) > 20:
-        return of_reads(conv.scalar_filters, geometry.reads) + conv.dim * of_reads(conv.vector_filters, geometry.reads)
-    of_scalars, of_vectors = conv.scalar_filters[0], conv.vector_filters[0]
+    filters, edges = (conv.scalar_filters, conv.vector_filters), geometry.edges
+    of_scalars, of_vectors = (each[0] for each in filters)
     vectors, vector_outputs = conv.in_channels[1], conv.out_channels[1]
+    if not radial.applies(torch.zeros(0), *(each.detach() for each in filters), edges):
+        width = len(of_scalars) * (of_scalars.numel() > 0) + conv.dim * len(of_vectors) * (of_vectors.numel() > 0)
+        gathered = len(edges) * (conv.dim * vectors + 2 * width)
+        return 2 * (gathered + edges.num_receivers * (filters[0].numel() + conv.dim * filters[1].numel()))
     directed = of_vectors.numel() - vectors * vector_outputs
     reads = of_scalars.numel() + directed + conv.dim * vectors * vector_outputs
-    return 2 * len(geometry.edges) * (3 * reads + conv.dim * (vectors + vector_outputs))
+    return 2 * len(edges) * (3 * reads + conv.dim * (vectors + vector_outputs))
 
 
 def of_reads(filters, reads):

@@ -96,7 +96,7 @@ def test_no_points(generator):
     assert found.shape == (0, 1)
 
 
-def test_applies_where_nothing_is_differentiated_and_outputs_are_few(generator):
+def test_applies_where_nothing_is_differentiated_and_reads_are_few(generator):
     layer, features, geometry = case(generator, CHANNELS[0])
     filters = layer.scalar_filters, layer.vector_filters
     assert not radial.applies(features, *filters, geometry.edges)  # the filters are to be learned
@@ -104,7 +104,8 @@ def test_applies_where_nothing_is_differentiated_and_outputs_are_few(generator):
     assert radial.applies(features, *fixed, geometry.edges)
     assert not radial.applies(features.clone().requires_grad_(), *fixed, geometry.edges)
     assert not radial.applies(features.half(), *fixed, geometry.edges)
-    wide = torch.zeros(6, 3, radial.MOST_OUTPUTS + 1, dtype=torch.float64)
+    wide = torch.zeros(6, 3, radial.MOST_READS // 3 + 1, dtype=torch.float64)  # two scalars and a vector
+    assert radial.applies(features, wide[:, :, 1:], fixed[1], geometry.edges)
     assert not radial.applies(features, wide, fixed[1], geometry.edges)
     with torch.inference_mode():
         assert radial.applies(features, *filters, geometry.edges)

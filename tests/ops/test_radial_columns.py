@@ -204,3 +204,18 @@ def test_differentiated_positions_take_the_general_path(generator):
     fixed = RadialGeometry(radius_graph(positions.detach(), 0.45), 6, window="poly6")
     assert radial_columns.applies(features, fixed.weighted_edges)
     assert not radial_columns.applies(features.half(), fixed.weighted_edges)
+    with torch.no_grad():
+        assert radial_columns.applies(features, geometry.weighted_edges)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("message", MESSAGES)
+def test_wide_layers_predict_what_they_are_trained_on(message, dtype, generator):
+    """To the last bit, and without arrays of all pairs."""
+    layer = layer_of(generator, ((10, 10), (20, 10)), 2, message=message, dtype=dtype)
+    geometry = geometry_of(generator, 2, window="poly6", dtype=dtype)
+    features = torch.randn(geometry.num_senders, 30, generator=generator, dtype=dtype)
+    with torch.no_grad():
+        predicted = layer(features, geometry)
+    assert not {"reads", "directions"} & vars(geometry).keys()
+    assert torch.equal(predicted, layer(features, geometry))

@@ -8,7 +8,7 @@ from systems import configured, model_of, observed_and_sample, periodic_frame, p
 
 import cconv
 from cconv.errors import ConfigError
-from cconv.rollout.rollout import Diverged, advance, rollout
+from cconv.rollout.rollout import Diverged, _most_in_a_cell, advance, rollout
 from cconv.tasks.integrators import SemiImplicitEuler
 
 EULER = SemiImplicitEuler()
@@ -78,3 +78,11 @@ def test_clumps_end_it_before_their_neighbours_are_searched(generator):
         return torch.where(near, from_center, 0.0) - window.last_displacements(scene.box)
 
     assert "particles clumped within two spacings" in ends(predict, generator)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_the_fullest_cell_is_counted_however_far_apart_particles_are(dim, generator):
+    cells = torch.randint(-2, 3, (200, dim), generator=generator)
+    cells[::10] *= 2**61
+    assert _most_in_a_cell(cells) == int(cells.unique(dim=0, return_counts=True)[1].max())
+    assert _most_in_a_cell(cells[:1]) == 1
