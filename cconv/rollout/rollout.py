@@ -1,6 +1,6 @@
 """The rollout: every answer of a model leads to the frame that the next one is asked about."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -9,7 +9,8 @@ from torch import Tensor
 
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
-from cconv.errors import CConvError
+from cconv.errors import CConvError, SimulationError
+from cconv.rollout.correctors import Corrector
 from cconv.tasks.integrators import Integrator
 from cconv.tasks.task import as_step
 
@@ -39,23 +40,30 @@ class Diverged(CConvError):
         self.frame, self.reason = frame, reason
 
 
-def rollout(model: StepModel, start: Window, scene: Scene) -> Iterator[Window]:
+def rollout(model: StepModel, start: Window, scene: Scene, *, correctors: Sequence[Corrector] = ()) -> Iterator[Window]:
     """Windows after a start, a frame later each, for as long as they are asked for.
 
     Args:
         model: Model of a step task, e.g. of `cconv.load_model`.
         start: The window to begin with, at least as long as the model's history.
         scene: Its scene.
+        correctors: What corrects every frame, one after another, before the model is asked about it, e.g.
+            `cconv.rollout.correctors.SPHRelaxation`.
 
     Raises:
         ConfigError: If the model predicts a field.
         Diverged: If the next frame would not be a state of particles any more.
     """
-    return advance(model.predict_frame, as_step(model.task).integrator, start, scene)
+    return advance(model.predict_frame, as_step(model.task).integrator, start, scene, correctors=correctors)
 
 
 def advance(
-    predict: Callable[[Window, Scene], Tensor], integrator: Integrator, start: Window, scene: Scene
+    predict: Callable[[Window, Scene], Tensor],
+    integrator: Integrator,
+    start: Window,
+    scene: Scene,
+    *,
+    correctors: Sequence[Corrector] = (),
 ) -> Iterator[Window]:
     """Windows after a start by any function that answers; `rollout` with the function of a model.
 
@@ -64,15 +72,27 @@ def advance(
         integrator: What turns an answer into the next frame.
         start: The window to begin with; its future is not looked at, unless `predict` does.
         scene: Its scene.
+        correctors: What corrects every frame, one after another, before it is asked about.
 
     Raises:
-        Diverged: If the next frame would not be a state of particles any more.
+        Diverged: If the next frame would not be a state of particles any more, or cannot be corrected.
     """
     window = replace(start, positions=start.positions.double())
     while True:
-        window = integrator.advance(window, predict(window, scene), scene)
+        before, window = window, integrator.advance(window, predict(window, scene), scene)
         check_state(window, scene)
+        for corrector in correctors:
+            window = _corrected(corrector, before, window, scene)
         yield window
+
+
+def _corrected(corrector: Corrector, before: Window, after: Window, scene: Scene) -> Window:
+    try:
+        corrected = corrector(before, after, scene)
+    except SimulationError as error:
+        raise Diverged(after.frame, str(error).removesuffix(".")) from error
+    check_state(corrected, scene)
+    return corrected
 
 
 def check_state(window: Window, scene: Scene) -> None:

@@ -1,4 +1,4 @@
-"""Smoothed particle hydrodynamics: smoothing kernels, the sums that networks learn, and a solver."""
+"""Smoothed particle hydrodynamics: smoothing kernels, the sums that networks learn, a solver, and a relaxation."""
 
 from cconv.sph.kernels import (
     KERNELS,
@@ -11,6 +11,7 @@ from cconv.sph.kernels import (
     kernel_named,
 )
 from cconv.sph.operators import density, density_gradient, density_rate, interpolate, velocity_gradient
+from cconv.sph.relaxation import relax
 from cconv.sph.solver import EquationOfState, ParticleState, Scheme, WeaklyCompressibleSPH
 
 __all__ = [
@@ -30,5 +31,6 @@ __all__ = [
     "density_rate",
     "interpolate",
     "kernel_named",
+    "relax",
     "velocity_gradient",
 ]

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from cconv.domain import Box
+from cconv.errors import ConfigError
 from cconv.neighbors import half_list
 from cconv.ops.workers import run_on_workers
 from cconv.sph import pair_loops
@@ -38,9 +40,13 @@ class NeighborList:
         box: Domain with its periodic axes.
         reach: Distance within which every pair must be listed.
         skin: Extra distance.
+
+    Raises:
+        ConfigError: If a periodic axis is too short for a pair to have one nearest image.
     """
 
     def __init__(self, box: Box, reach: float, skin: float):
+        _check_wide_enough(box, reach + skin)
         self._box, self._reach, self._skin = box, reach, skin
         self._lengths = periodic_lengths(box)
         self._searched_at, self._walls_then = np.empty((0, 3)), np.empty(0, bool)
@@ -64,3 +70,32 @@ def periodic_lengths(box: Box) -> np.ndarray:
     lengths = np.full(3, np.inf)
     lengths[: box.dim] = np.where(box.periodic, box.lengths, np.inf)
     return lengths
+
+
+def padded(vectors: Tensor) -> np.ndarray:
+    """Vectors (N, D) in float64 with three components, the further ones zero, as `pair_loops` take them."""
+    array = np.zeros((len(vectors), 3))
+    array[:, : vectors.shape[1]] = vectors.numpy()
+    return array
+
+
+def unpadded(vectors: np.ndarray, dim: int) -> Tensor:
+    """The first components of vectors (N, 3), a tensor (N, D) of its own."""
+    return torch.from_numpy(vectors[:, :dim].copy())
+
+
+def moved(positions: np.ndarray, velocities: np.ndarray, time_step: float, box: Box) -> np.ndarray:
+    """Positions (N, 3) a time step later, brought back into the box along periodic axes."""
+    lower, later = np.zeros(3), np.empty_like(positions)
+    lower[: box.dim] = box.lower
+    pair_loops.move(positions, velocities, time_step, lower, periodic_lengths(box), later)
+    return later
+
+
+def _check_wide_enough(box: Box, reach: float) -> None:
+    for axis, (length, periodic) in enumerate(zip(box.lengths, box.periodic, strict=True)):
+        if periodic and length < 2 * reach:
+            raise ConfigError(
+                f"`box` must be at least {2 * reach:.4g} long on its periodic axis {axis}, twice the reach of the "
+                f"kernel and the skin, got {length:g}; take a smaller particle spacing."
+            )

@@ -30,7 +30,7 @@ from cconv.neighbors import radius_graph
 from cconv.sph import pair_loops
 from cconv.sph.kernel_table import kernel_tables
 from cconv.sph.kernels import AbstractKernel
-from cconv.sph.neighbor_list import NeighborList, periodic_lengths
+from cconv.sph.neighbor_list import NeighborList, moved, padded, periodic_lengths, unpadded
 
 DENSITY_SCHEMES = ("summation", "evolution")
 CFL = 0.25
@@ -198,13 +198,11 @@ class WeaklyCompressibleSPH:
             raise ConfigError(f"`kernel` must have the dimension of `box` ({box.dim}), got {kernel.dim}.")
         if not skin >= 0:
             raise ConfigError(f"`skin` must be at least 0, got {skin}.")
-        _check_wide_enough(box, kernel.support_radius + skin * particle_spacing)
         self.box, self.particle_spacing, self.equation_of_state = box, particle_spacing, equation_of_state
         self._kernel, self._tables = kernel, kernel_tables(kernel)
         self._scheme, self._force = scheme, force
         self._artificial = scheme.artificial_viscosity * kernel.smoothing_length * equation_of_state.sound_speed
-        self._lengths, self._lower = periodic_lengths(box), np.zeros(3)
-        self._lower[: box.dim] = box.lower
+        self._lengths = periodic_lengths(box)
         self._neighbors = NeighborList(box, kernel.support_radius, skin * particle_spacing)
 
     def initial_state(
@@ -275,14 +273,14 @@ class WeaklyCompressibleSPH:
         accelerations, shifts, now.densities = self._accelerations(now)
         now.velocities = now.velocities + time_step * accelerations
         now.transport_velocities = now.velocities + 0.5 * time_step * shifts
-        now.positions = self._moved(now, time_step)
+        now.positions = moved(now.positions, now.transport_velocities, time_step, self.box)
         _check_whole(now.positions, self.box, state.steps + 1)
         now.densities = self._next_densities(now, time_step, state.steps + 1)
         return replace(
             state,
-            positions=_unpadded(now.positions, self.box.dim),
-            velocities=_unpadded(now.velocities, self.box.dim),
-            transport_velocities=_unpadded(now.transport_velocities, self.box.dim),
+            positions=unpadded(now.positions, self.box.dim),
+            velocities=unpadded(now.velocities, self.box.dim),
+            transport_velocities=unpadded(now.transport_velocities, self.box.dim),
             densities=torch.from_numpy(now.densities),
             steps=state.steps + 1,
         )
@@ -294,7 +292,7 @@ class WeaklyCompressibleSPH:
         rows = self._neighbors.rows(now.positions, now.is_wall)
         force = np.zeros_like(now.positions)
         if self._force is not None:
-            force[:, : self.box.dim] = self._force(_unpadded(now.positions, self.box.dim)).numpy()
+            force[:, : self.box.dim] = self._force(unpadded(now.positions, self.box.dim)).numpy()
         densities, pressures = now.densities, eos.pressure(now.densities)
         velocities, transport = now.velocities, now.transport_velocities
         if now.has_walls:
@@ -312,11 +310,6 @@ class WeaklyCompressibleSPH:
             accelerations, shifts,
         )  # fmt: skip
         return accelerations + np.where(now.is_wall[:, None], 0.0, force), shifts, densities
-
-    def _moved(self, now: "_Arrays", time_step: float) -> np.ndarray:
-        moved = np.empty_like(now.positions)
-        pair_loops.move(now.positions, now.transport_velocities, time_step, self._lower, self._lengths, moved)
-        return moved
 
     def _next_densities(self, now: "_Arrays", time_step: float, steps: int) -> np.ndarray:
         if self._scheme.density == "summation":
@@ -349,32 +342,13 @@ class _Arrays:
 
     def __init__(self, state: ParticleState):
         self.positions, self.velocities, self.transport_velocities = (
-            _padded(vectors) for vectors in (state.positions, state.velocities, state.transport_velocities)
+            padded(vectors) for vectors in (state.positions, state.velocities, state.transport_velocities)
         )
         self.densities, self.masses, self.viscosities = (
             values.numpy() for values in (state.densities, state.masses, state.viscosities)
         )
         self.is_wall = state.is_wall.numpy()
         self.has_walls = bool(self.is_wall.any())
-
-
-def _padded(vectors: Tensor) -> np.ndarray:
-    padded = np.zeros((len(vectors), 3))
-    padded[:, : vectors.shape[1]] = vectors.numpy()
-    return padded
-
-
-def _unpadded(vectors: np.ndarray, dim: int) -> Tensor:
-    return torch.from_numpy(vectors[:, :dim].copy())
-
-
-def _check_wide_enough(box: Box, reach: float) -> None:
-    for axis, (length, periodic) in enumerate(zip(box.lengths, box.periodic, strict=True)):
-        if periodic and length < 2 * reach:
-            raise ConfigError(
-                f"`box` must be at least {2 * reach:.4g} long on its periodic axis {axis}, twice the reach of the "
-                f"kernel and the skin, got {length:g}; take a smaller particle spacing."
-            )
 
 
 def _outside(positions: np.ndarray, box: Box) -> np.ndarray:

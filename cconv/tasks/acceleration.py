@@ -7,6 +7,7 @@ from cconv.tasks.features import (
     DENSITY,
     FORCE,
     PARTICLE_TYPE,
+    PRESSURE_SOURCE,
     VELOCITY,
     WALL_DISTANCE,
     WALL_NORMAL,
@@ -21,8 +22,8 @@ class Acceleration(StepTask):
     """Second difference of the positions at the present frame.
 
     Features: the velocity, the last displacement, which networks know only as differences where their messages take
-    differences of vectors; the `history - 2` accelerations before; SPH density; whether a particle is one of a wall;
-    how near the nearest wall point is and the direction away from the walls, both within the support radius of the
+    differences of vectors; the `history - 2` accelerations before; SPH density; the source of the pressure, which
+    lets a single linear layer know what pressure the motion calls for; whether a particle is one of a wall; how near the nearest wall point is and the direction away from the walls, both within the support radius of the
     task's kernel; the external force at the particle's place. Wall particles have velocities as well: the difference
     from a lid that slides is its velocity relative to the fluid, and needs no feature of its own. Source:
     Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks" (ICML 2020), section 4.1, whose
@@ -39,6 +40,7 @@ class Acceleration(StepTask):
     features = (
         CONSTANT,
         DENSITY,
+        PRESSURE_SOURCE,
         PARTICLE_TYPE,
         WALL_DISTANCE,
         ACCELERATIONS,
@@ -47,7 +49,7 @@ class Acceleration(StepTask):
         VELOCITY,
         WALLS,
     )
-    optional = (DENSITY, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
+    optional = (DENSITY, PRESSURE_SOURCE, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
     checks = ("completion", "motion", "packing")
     integrator = SemiImplicitEuler()
 

@@ -21,11 +21,11 @@ from cconv.errors import ShapeError
 from cconv.neighbors import Edges, radius_graph
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.sph.kernels import AbstractKernel
-from cconv.sph.operators import density
+from cconv.sph.operators import density, velocity_gradient
 
 CONSTANT, DENSITY, PARTICLE_TYPE, NORMAL = "one", "density", "particle_type", "normal"  # names of features
 ACCELERATIONS, FORCE, VELOCITY = "accelerations", "force", "velocity"
-WALL_DISTANCE, WALL_NORMAL = "wall_distance", "wall_normal"
+PRESSURE_SOURCE, WALL_DISTANCE, WALL_NORMAL = "pressure_source", "wall_distance", "wall_normal"
 WALLS = "walls"  # stands among the features of a task for those of the wall points
 
 
@@ -270,6 +270,18 @@ class WindowState(FluidState):
         """Masses of the fluid particles (M,)."""
         return self.masses[self.is_fluid]
 
+    @property
+    def pressure_sources(self) -> Float[Tensor, " N"]:
+        r"""Source of the pressure in the Poisson equation of an incompressible flow, divided by the density, (N,).
+
+        .. math:: -\frac{\nabla^2 p}{\rho} = \frac{\partial v_a}{\partial x_b} \frac{\partial v_b}{\partial x_a}
+
+        It is positive where the flow strains and negative where it turns. Networks whose values are scalars and vectors
+        cannot form it, since it is a square of a tensor. Source: Pope, "Turbulent Flows" (2000), section 2.5.
+        """
+        gradients = velocity_gradient(self.masses / self.densities, self.velocities, self.edges, self.kernel)
+        return torch.einsum("nab,nba->n", gradients, gradients)
+
     @cached_property
     def wall_edges(self) -> Edges:
         """Wall points within the kernel's support of the fluid particles, which are counted among themselves."""
@@ -337,6 +349,7 @@ def window_state(
 _SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
     CONSTANT: lambda state, units: torch.ones_like(state.masses),
     DENSITY: lambda state, units: state.densities / units.density,
+    PRESSURE_SOURCE: lambda state, units: state.pressure_sources * units.time**2,
     PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
     WALL_DISTANCE: lambda state, units: state.wall_distances,
 }

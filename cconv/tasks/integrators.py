@@ -1,6 +1,6 @@
 """Integrators: how an answer becomes the next frame, and which answer would lead to the stored one."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -8,6 +8,7 @@ from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 
 
+@runtime_checkable
 class Integrator(Protocol):
     """Leads from a window to the next frame.
 
