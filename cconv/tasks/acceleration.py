@@ -22,12 +22,13 @@ class Acceleration(StepTask):
     """Second difference of the positions at the present frame.
 
     Features: the velocity, the last displacement, which networks know only as differences where their messages take
-    differences of vectors; the `history - 2` accelerations before; SPH density; the source of the pressure, which
-    lets a single linear layer know what pressure the motion calls for; whether a particle is one of a wall; how near the nearest wall point is and the direction away from the walls, both within the support radius of the
-    task's kernel; the external force at the particle's place. Wall particles have velocities as well: the difference
-    from a lid that slides is its velocity relative to the fluid, and needs no feature of its own. Source:
-    Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks" (ICML 2020), section 4.1, whose
-    velocities are those sums, with distances to walls clipped at the cutoff; LagrangeBench (Toshev et al., 2023).
+    differences of vectors; the `history - 2` accelerations before; SPH density; the source of the pressure, which tells
+    a single linear layer what pressure the motion calls for; whether a particle is one of a wall; how near the nearest
+    wall point is and the direction away from the walls, both within the support radius of the task's kernel; the
+    external force at the particle's place. Wall particles have velocities as well: the difference from a lid that
+    slides is its velocity relative to the fluid, and needs no feature of its own. Source: Sanchez-Gonzalez et al.,
+    "Learning to Simulate Complex Physics with Graph Networks" (ICML 2020), section 4.1, whose velocities are those
+    sums, with distances to walls clipped at the cutoff; LagrangeBench (Toshev et al., 2023).
     """
 
     name = "acceleration"
