@@ -25,7 +25,7 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from cconv.data.folders import whole_file
 from cconv.data.quantities import density_deviation, speed
-from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory, check_frames
+from cconv.data.trajectory import Frame, Frames, ParticleType, Scene, check_frames, time_of
 from cconv.errors import ConfigError, check_choice
 
 Progress = Callable[[Iterable, str], Iterable]
@@ -44,7 +44,7 @@ _WALL_COLOR, _BOUNDARY_COLOR = "#b3b3b3", "#cccccc"
 
 
 def frames_chart(
-    trajectory: Trajectory,
+    trajectory: Frames,
     scene: Scene,
     frames: Sequence[int],
     color: str = "speed",
@@ -83,7 +83,7 @@ def write_picture(figure: Figure, file: str | Path) -> None:
 
 def write_animation(
     file: str | Path,
-    trajectory: Trajectory | Mapping[str, Trajectory],
+    trajectory: Frames | Mapping[str, Frames],
     scene: Scene,
     frames: Sequence[int],
     color: str = "speed",
@@ -104,7 +104,7 @@ def write_animation(
             of range, the colour unknown or the scene 1D.
     """
     writer = animation_writer(file)
-    drawn = {"": trajectory} if isinstance(trajectory, Trajectory) else trajectory
+    drawn = trajectory if isinstance(trajectory, Mapping) else {"": trajectory}
     first, *others = drawn.values()
     colorings = [_coloring(color, first, scene, frames, progress)]
     colorings += [_coloring(color, other, scene, frames, progress).as_in(colorings[0]) for other in others]
@@ -126,6 +126,11 @@ def check_picture_name(file: str | Path) -> None:
     """Raise `ConfigError` unless the name ends in .png."""
     if Path(file).suffix.lower() != ".png":
         raise ConfigError(f"{file}: a picture is written as PNG; name a file that ends in .png.")
+
+
+def animation_suffixes() -> tuple[str, ...]:
+    """Suffixes of the animations that can be written here: .gif, and .mp4 where ffmpeg is found."""
+    return (".gif", ".mp4") if FFMpegWriter.isAvailable() else (".gif",)
 
 
 def animation_writer(file: str | Path) -> AbstractMovieWriter:
@@ -202,7 +207,7 @@ class _ByType:
         return self
 
 
-def _by_speed(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByValue:
+def _by_speed(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByValue:
     values = {k: speed(trajectory[k]).double().numpy() for k in frames}
     is_wall = _is_wall(trajectory.particle_types.numpy())
     top, beyond = _limit(values, is_wall, 0.995)
@@ -210,7 +215,7 @@ def _by_speed(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _B
     return _ByValue(values, is_wall, scale, "speed", "max" if beyond else "neither")
 
 
-def _by_density(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByValue:
+def _by_density(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByValue:
     values = {k: 100 * density_deviation(trajectory[k], scene).numpy() for k in frames}
     is_wall = _is_wall(trajectory.particle_types.numpy())
     top, beyond = _limit(values, is_wall, 0.9)
@@ -218,18 +223,18 @@ def _by_density(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> 
     return _ByValue(values, is_wall, scale, "density deviation [%]", "both" if beyond else "neither")
 
 
-def _by_type(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByType:
+def _by_type(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByType:
     return _ByType(trajectory.particle_types.numpy(), scene.dim == 2 and trajectory.boundary is not None)
 
 
-COLORINGS: dict[str, Callable[[Trajectory, Scene, Iterable[int]], _Coloring]] = {
+COLORINGS: dict[str, Callable[[Frames, Scene, Iterable[int]], _Coloring]] = {
     "speed": _by_speed,
     "density": _by_density,
     "type": _by_type,
 }
 
 
-def _coloring(color: str, trajectory: Trajectory, scene: Scene, frames: Sequence[int], progress: Progress) -> _Coloring:
+def _coloring(color: str, trajectory: Frames, scene: Scene, frames: Sequence[int], progress: Progress) -> _Coloring:
     check_choice("color", color, COLORINGS)
     check_frames(trajectory, frames)
     return COLORINGS[color](trajectory, scene, progress(frames, color))
@@ -254,7 +259,7 @@ class _Stage(Protocol):
     aspect: float  # width of a panel by its height
     projection: str | None
 
-    def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes, trajectory: Frames) -> None:
         """Limits, labels and what does not move."""
 
     def draw(self, axes: Axes, frame: Frame, colors: np.ndarray) -> Artist:
@@ -270,7 +275,7 @@ class _Plane:
         self._scene = scene
         self.aspect: float = scene.box.lengths[0] / scene.box.lengths[1]
 
-    def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes, trajectory: Frames) -> None:
         box = self._scene.box
         axes.set(xlim=(box.lower[0], box.upper[0]), ylim=(box.lower[1], box.upper[1]), xlabel="x", ylabel="y")
         axes.set_aspect("equal")
@@ -299,7 +304,7 @@ class _Space:
         self._scene = scene
         self._vertical = "xyz"[int(np.argmax(np.abs(scene.force)))] if scene.force else "y"
 
-    def prepare(self, axes: Axes3D, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes3D, trajectory: Frames) -> None:
         box = self._scene.box
         for axis, low, high in zip("xyz", box.lower, box.upper, strict=True):
             axes.set(**{f"{axis}lim": (low, high)})
@@ -340,7 +345,7 @@ def _stage(scene: Scene) -> _Stage:
 
 
 def _set_up(
-    stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, count: int
+    stage: _Stage, coloring: _Coloring, trajectory: Frames, scene: Scene, count: int
 ) -> tuple[Figure, list[Axes]]:
     """A figure of `count` panels that lacks only the particles."""
     rows, columns = _grid(count, stage.aspect)
@@ -386,8 +391,8 @@ def _label_outer(panels: Sequence[Axes], columns: int) -> None:
 
 
 def _draw_frame(
-    axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, k: int, title: str = ""
+    axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Frames, scene: Scene, k: int, title: str = ""
 ) -> Artist:
-    moment = f"frame {trajectory.first_frame + k if title else k}, t = {trajectory.time(k, scene.frame_dt):.4g}"
+    moment = f"frame {trajectory.first_frame + k if title else k}, t = {time_of(trajectory, k, scene.frame_dt):.4g}"
     axes.set_title(f"{title}: {moment}" if title else moment, fontsize=10)
     return stage.draw(axes, trajectory[k], coloring.colors(k))
