@@ -1,5 +1,6 @@
 """LagrangeBench folders that grow a frame at a time, and keep the frames so far whatever ends them."""
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -98,7 +99,8 @@ def growing_dataset(folder: Path, scene: Scene, begun: Trajectory, metadata: Map
 class _GrowingFile:
     """An HDF5 file with one trajectory, which can be closed and read however far it came.
 
-    HDF5 loses a file whose disk is full when it writes. So the bytes after its end are taken before each frame.
+    HDF5 loses a file whose disk is full when it writes. So the bytes after its end are taken before each frame, and
+    given back at the end.
     """
 
     def __init__(self, path: Path, begun: Trajectory, scene: Scene):
@@ -137,6 +139,8 @@ class _GrowingFile:
         """Keep the first `count` frames, and close the file; give their statistics."""
         with _one_kind_of_errors():
             self._positions.resize(count, axis=0)
+            self._file.flush()
+        os.truncate(self._path, self._file.id.get_filesize())
         summary = Summary(self._box)
         for begins in range(0, count, FRAMES_OF_A_PIECE):
             piece = torch.from_numpy(self._positions[begins : begins + FRAMES_OF_A_PIECE + 2])

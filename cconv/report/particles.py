@@ -64,7 +64,7 @@ def frames_chart(
     """
     coloring = _coloring(color, trajectory, scene, frames, progress)
     stage = _stage(scene)
-    figure, panels = _set_up(stage, coloring, trajectory, scene, len(frames))
+    figure, panels = _set_up(stage, coloring, trajectory, _title(trajectory, scene), len(frames))
     for axes, k in zip(panels, frames, strict=True):
         _draw_frame(axes, stage, coloring, trajectory, scene, k)
     return figure
@@ -109,13 +109,14 @@ def write_animation(
     colorings = [_coloring(color, first, scene, frames, progress)]
     colorings += [_coloring(color, other, scene, frames, progress).as_in(colorings[0]) for other in others]
     stage = _stage(scene)
-    figure, panels = _set_up(stage, colorings[0], first, scene, len(drawn))
+    title = scene.name if others else _title(first, scene)
+    figure, panels = _set_up(stage, colorings[0], first, title, len(drawn))
     dpi = ANIMATION_DPI if len(drawn) == 1 else SIDE_BY_SIDE_DPI
     with whole_file(Path(file)) as partial, writer.saving(figure, partial, dpi):
         for k in progress(frames, "animation"):
             particles = [
-                _draw_frame(axes, stage, coloring, each, scene, k, title)
-                for axes, coloring, (title, each) in zip(panels, colorings, drawn.items(), strict=True)
+                _draw_frame(axes, stage, coloring, each, scene, k, name)
+                for axes, coloring, (name, each) in zip(panels, colorings, drawn.items(), strict=True)
             ]
             writer.grab_frame()
             for artist in particles:
@@ -345,7 +346,7 @@ def _stage(scene: Scene) -> _Stage:
 
 
 def _set_up(
-    stage: _Stage, coloring: _Coloring, trajectory: Frames, scene: Scene, count: int
+    stage: _Stage, coloring: _Coloring, trajectory: Frames, title: str, count: int
 ) -> tuple[Figure, list[Axes]]:
     """A figure of `count` panels that lacks only the particles."""
     rows, columns = _grid(count, stage.aspect)
@@ -364,10 +365,14 @@ def _set_up(
         stage.prepare(axes, trajectory)
     if shared:
         _label_outer(panels, columns)
-    figure.suptitle(f"{scene.name}, trajectory {trajectory.name}", fontsize=12)
+    figure.suptitle(title, fontsize=12)
     coloring.draw_key(figure, panels)
     figure.draw_without_rendering()  # places the panels, from which 3D markers take their size
     return figure, panels
+
+
+def _title(trajectory: Frames, scene: Scene) -> str:
+    return f"{scene.name}, trajectory {trajectory.name}"
 
 
 def _grid(count: int, aspect: float) -> tuple[int, int]:
