@@ -50,7 +50,8 @@ def energy_chart(rollouts: Rollouts) -> Figure:
                 axes.plot(each.looked_at, each.rollout.e_kin, color=color, lw=1.2, marker=".", ms=3, label=label)
         longest = max(_of_trajectory(rollouts, trajectory), key=lambda each: len(each.looked_at))
         axes.plot(longest.looked_at, longest.reference.e_kin, color=ANALYTIC_COLOR, ls="--", label="stored")
-        axes.set(yscale="log", xlabel="frame of the rollout", ylabel="kinetic energy", title=trajectory)
+        axes.set(yscale="log", xlabel="frame of the rollout", ylabel="kinetic energy")
+        axes.set_title(trajectory, parse_math=False)  # a name in the data
     _legend(panels[-1])
     return figure
 
