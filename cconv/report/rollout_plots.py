@@ -1,6 +1,7 @@
 """Charts of the finalists' rollouts over test trajectories. Each function returns a matplotlib figure of its own."""
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 
 import numpy as np
 import pandas as pd
@@ -96,7 +97,7 @@ def _colors(rollouts: Rollouts) -> dict[str, ColorType]:
 
 def _table(series: Sequence[Sequence[float]]) -> np.ndarray:
     """Series of different lengths as rows, nan after their ends."""
-    return pd.DataFrame(map(list, series)).to_numpy(dtype=float)
+    return np.array(list(zip_longest(*series, fillvalue=np.nan))).T
 
 
 def _of_trajectory(rollouts: Rollouts, trajectory: str) -> list[RolledTrajectory]:
