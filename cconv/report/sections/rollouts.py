@@ -20,7 +20,7 @@ class RolloutsSection(Section):
         from cconv.report.rollout_animation import animated  # takes torch, which takes seconds
 
         rollouts = read_rollouts(records.run, summary.rolled)
-        known = {"lost": {name: found.lost for name, found in rollouts.items() if found.lost}}
+        known: dict[str, Any] = {"lost": {name: found.lost for name, found in rollouts.items() if found.lost}}
         frames = records.run.path / FOLDER / FRAMES
         known["animation"] = animated(frames) if frames.is_dir() else None
         if not any(found.rolled for found in rollouts.values()):
