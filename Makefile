@@ -22,8 +22,8 @@ study: $(VENV)/.installed $(DATA)/metadata.json
 
 rollout: $(VENV)/.installed $(VORTICES)/metadata.json
 	$(VENV)/bin/cconv study run experiments/rollout.toml --data $(VORTICES) --out $(ROLLED) --overwrite
-	rm -rf $(ROLLED)/rollouts
-	$(VENV)/bin/cconv rollout $(ROLLED) --out $(ROLLED)/rollouts
+	rm -rf $(ROLLED)/rolled
+	$(VENV)/bin/cconv rollout $(ROLLED) --out $(ROLLED)/rolled
 
 test: $(VENV)/.installed
 	$(VENV)/bin/pytest $(ON_ALL_CORES)

@@ -21,6 +21,7 @@ from cconv.study.records.found import (
     SpentUpdates,
     TrialPoint,
 )
+from cconv.study.records.rollouts import FinalistRollouts, FlowSeries, RolledTrajectory
 from cconv.study.records.summary import (
     AnalyticCost,
     AttainmentStep,
@@ -60,7 +61,7 @@ def minimal_summary(summary: Summary) -> Summary:
     selected = {name: getattr(summary, name) for name in Selected.model_fields}
     models = {entry.id: summary.growth.models[entry.id] for entry in summary.finalists}
     growth = changed(summary.growth, models=models, exponents={})
-    nothing = {"checks": {}, "search_points": (), "cost_model": None, "analytic": None, "explained": ()}
+    nothing = {"checks": {}, "search_points": (), "cost_model": None, "analytic": None, "explained": (), "rolled": ()}
     return Summary(**selected | nothing | {"growth": growth})
 
 
@@ -78,6 +79,7 @@ def whole_summary(summary: Summary) -> Summary:
             ms_per_frame=2.2, ms_low=2.1, ms_high=2.35, geometry_ms=1.5, network_ms=0.7, turns_ms=(2.1, 2.2, 2.35)
         ),
         explained=list(dict.fromkeys([summary.recommended.id, summary.baseline])),
+        rolled=ids,
         front=_front(),
         growth=Growth(
             sizes=(1000, 100_000),
@@ -249,6 +251,33 @@ def explanation(dim: int = 2, components: int = 1, particles: int = 60) -> dict[
         "error_levels": np.array([0.5, 1.0]),
         "error_quantiles": np.array([0.01, 0.1]),
     }
+
+
+def rollouts(ended: str = "") -> FinalistRollouts:
+    """Rollouts of two trainings over two trajectories; the last of them may have ended early."""
+    rolled = [_rolled(seed, name, 12, "") for seed in ("seed_1", "seed_2") for name in ("test/00000", "test/00001")]
+    rolled[-1] = _rolled("seed_2", "test/00001", 7 if ended else 12, ended)
+    return FinalistRollouts(rolled=rolled, lost=())
+
+
+def _rolled(seed: str, trajectory: str, frames: int, ended: str) -> RolledTrajectory:
+    looks = range(3, frames + 1, 3)
+    return RolledTrajectory(
+        seed=seed,
+        trajectory=trajectory,
+        stored=12,
+        mse=[1e-6 * (frame + 1) ** 2 for frame in range(frames)],
+        looked_at=looks,
+        rollout=_flow(1.1, len(looks)),
+        reference=_flow(1.0, len(looks)),
+        beyond={"energy too high": 5} if ended else {},
+        ended=ended,
+    )
+
+
+def _flow(energy: float, looks: int) -> FlowSeries:
+    shares = [0.25, 0.5, 0.25, 0.0]
+    return FlowSeries(e_kin=[energy * 0.9**look for look in range(looks)], neighbors=shares, speeds=shares)
 
 
 def seed_variance(updates: int) -> SeedVariance:

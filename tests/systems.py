@@ -1,20 +1,22 @@
 """Small scenes that tests build in memory."""
 
 import math
+from pathlib import Path
 
 import torch
 
+from cconv.data.dataset import open_dataset
 from cconv.data.trajectory import Boundary, Frame, Scene, Trajectory
 from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.models.model import Model, build_model
-from cconv.networks import ARCHITECTURES
+from cconv.networks import ARCHITECTURES, RadialNetSettings
 from cconv.sph.kernels import CubicSpline
 from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
-from cconv.tasks.samples import Sample, make_sample, make_step_sample
-from cconv.tasks.task import StepTask, as_field
+from cconv.tasks.samples import Sample, learned_samples, make_sample, make_step_sample
+from cconv.tasks.task import StepTask, as_field, as_step
 
 
 def periodic_scene(particles_per_side: int = 8) -> Scene:
@@ -169,3 +171,10 @@ def model_of(
     known = set(configuration.features) <= set(asked.features)
     features = configuration.features if known else asked.features
     return build_model(configuration.network, asked, features, scene, train_samples, generator)
+
+
+def untrained_step(folder: Path) -> Model:
+    """A model of steps on a data set, with the weights that it begins with."""
+    flow, task = open_dataset(folder), as_step(task_named("acceleration"))
+    samples = list(learned_samples(flow, "train", task))
+    return build_model(RadialNetSettings(layers=1), task, task.features, flow.scene, samples)

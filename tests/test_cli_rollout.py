@@ -1,6 +1,7 @@
 """A step is fitted, trained, evaluated and rolled out from the command line."""
 
 import json
+import resource
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from particle_files import record_frames, write_parts
 
 from cconv.data.dataset import open_dataset
 from cconv.forces import ConstantForce
+from cconv.report.particles import animation_suffixes
 
 STUDY = """
 name = "steps"
@@ -105,7 +107,7 @@ def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, t
     assert facts["solver"]["milliseconds_per_frame"] > 0
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "train.h5", "valid.h5", "test.h5", "metadata.json", "metrics.json", "rollout.gif", "vtk"
-    }  # fmt: skip
+    } | {f"rollout{suffix}" for suffix in animation_suffixes()}  # fmt: skip
     with h5py.File(tmp_path / "out" / "test.h5") as file:
         assert file["00000/position"].shape == (10, 100, 2)
 
@@ -211,12 +213,12 @@ def test_a_model_of_a_field_is_refused(flow_folder, cconv, tmp_path):
 
 
 def test_what_ends_the_metrics_loses_no_frame(fitted, cconv, tmp_path, monkeypatch):
-    from cconv.evaluation import recorded_rollout
+    from cconv.evaluation.rollout_comparison import RolloutMeter
 
-    def stops(*arguments, **keywords):
+    def stops(meter):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recorded_rollout, "rollout_metrics", stops)
+    monkeypatch.setattr(RolloutMeter, "metrics", stops)
     assert cconv("rollout", fitted, "--out", tmp_path / "out")[0] == 130
     assert len(open_dataset(tmp_path / "out").trajectory("test", 0)) == 16
 
@@ -237,6 +239,88 @@ def test_ctrl_c_keeps_the_frames_so_far(fitted, cconv, tmp_path, monkeypatch):
     assert code == 130
     assert "4 frames from frame 3 on; it interrupted" in printed or "interrupted" in printed
     assert len(open_dataset(tmp_path / "out").trajectory("test", 0)) == 7
+
+
+@pytest.mark.parametrize("last", [0, 5])
+def test_a_disk_that_is_full_is_one_line_and_keeps_the_frames_so_far(last, fitted, cconv, tmp_path, monkeypatch):
+    """A limit of the system for the size of files, which ends writing as a full disk does."""
+    from cconv.models.model import Model
+
+    predict, answers, limits = Model.predict_frame, SimpleNamespace(count=0), resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fills(self, frame, scene):
+        answers.count += 1
+        if answers.count == last + 1:
+            (partial,) = tmp_path.glob(".out.*/test.h5")
+            resource.setrlimit(resource.RLIMIT_FSIZE, (partial.stat().st_size, limits[1]))
+        return predict(self, frame, scene)
+
+    monkeypatch.setattr(Model, "predict_frame", fills)
+    try:
+        outcome = cconv("rollout", fitted, "--out", tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert_one_clear_line(outcome, str(tmp_path / "out"), "cannot be written", "File too large")
+    assert answers.count == last + 1
+    if last == 0:
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert "the 5 frames so far are kept" in outcome[2]
+        assert [file.name for file in tmp_path.iterdir()] == ["out"]
+        assert {len(open_dataset(tmp_path / "out").trajectory(split, 0)) for split in ("train", "valid", "test")} == {8}
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_anything_is_predicted(fitted, cconv, tmp_path, monkeypatch):
+    from cconv.models.model import Model
+
+    monkeypatch.setattr(Model, "predict_frame", lambda *_: pytest.fail("a frame was predicted"))
+    (tmp_path / "file").write_text("")
+    outcome = cconv("rollout", fitted, "--out", tmp_path / "file" / "out")
+    assert_one_clear_line(outcome, str(tmp_path / "file" / "out"), "cannot be written")
+
+
+def test_a_damaged_stored_frame_is_told_before_anything_is_predicted(
+    fitted, steps_folder, cconv, tmp_path, monkeypatch
+):
+    from cconv.models.model import Model
+
+    monkeypatch.setattr(Model, "predict_frame", lambda *_: pytest.fail("a frame was predicted"))
+    shutil.copytree(steps_folder, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / "test.h5", "r+") as file:
+        file["00000/position"][9, 3] = np.nan
+    outcome = cconv("rollout", fitted, "--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert_one_clear_line(outcome, "trajectory test/00000, frame 9: `position` has a NaN")
+    assert [file.name for file in tmp_path.iterdir()] == ["data"]
+
+
+def test_a_film_is_written_where_ffmpeg_is_found(fitted, cconv, tmp_path, monkeypatch):
+    from matplotlib.animation import FFMpegWriter
+
+    assert cconv("rollout", fitted, "--frames", 2, "--out", tmp_path / "out")[0] == 0
+    assert (tmp_path / "out" / "rollout.mp4").exists() == FFMpegWriter.isAvailable()
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+    code, _, said = cconv("rollout", fitted, "--frames", 2, "--out", tmp_path / "other")
+    assert (code, said) == (0, "")
+    assert [file.name for file in (tmp_path / "other").glob("rollout*")] == ["rollout.gif"]
+
+
+def test_a_run_that_has_recommended_nothing_is_one_line(fitted, cconv, tmp_path):
+    (tmp_path / "study.json").write_text(
+        json.dumps({"format": 4, "name": "a", "stages": {"select": {"kind": "select"}}})
+    )
+    for command in ("evaluate", "rollout"):
+        assert_one_clear_line(cconv(command, tmp_path), str(tmp_path), "has not recommended a model yet")
+
+
+def test_a_rollout_without_a_frame_ends_with_1_and_leaves_nothing(fitted, cconv, tmp_path, monkeypatch):
+    from cconv.models.model import Model
+
+    predict = Model.predict_frame
+    monkeypatch.setattr(Model, "predict_frame", lambda *given: predict(*given) * float("nan"))
+    code, printed, said = cconv("rollout", fitted, "--out", tmp_path / "out")
+    assert (code, printed) == (1, "")
+    assert "the rollout diverged at frame 3: positions are not finite" in said
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_rollout_that_diverges_says_so_and_ends_with_1(fitted, cconv, monkeypatch):

@@ -13,10 +13,10 @@ from unittest import mock
 import pytest
 import typer
 from conftest import SMOKE
-from fuzzing import changed_bytes, changed_json, changed_toml, check_call, examples, places, values
+from fuzzing import changed_bytes, changed_json, changed_toml, check_call, examples, numbers, places, strings, values
 from hypothesis import given
 from hypothesis import strategies as st
-from systems import configured, problem
+from systems import configured, problem, untrained_step
 from torch import Generator
 
 from cconv.models.checkpoint import save_model
@@ -44,8 +44,8 @@ def overrides(draw):
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory, flow_folder):
-    """Data, a run folder with two trials, and a checkpoint; all small."""
+def material(tmp_path_factory, flow_folder, steps_folder):
+    """A run folder with two trials, a checkpoint of a field and one of steps; all small."""
     folder = tmp_path_factory.mktemp("fuzz")
     study = with_data_path(load_study(SMOKE), str(flow_folder))
     run = RunFolder.create(folder / "run")
@@ -62,6 +62,7 @@ def material(tmp_path_factory, flow_folder):
     given_problem = problem(Generator().manual_seed(0))
     model = given_problem.build_model(configured(layers=1, kernel_size=3, relative_cutoff=1.5), 0)
     save_model(model, folder / "checkpoint", provenance(study) | {"data_seed": 0})
+    save_model(untrained_step(steps_folder), folder / "step", {"task": "acceleration", "data_seed": 0})
     return folder
 
 
@@ -108,7 +109,17 @@ RECORDS = (
     "study.json", "space.json", "state.json", "rungs.json", "stages/random.json",
     *(f"trials/random_0000/{name}" for name in ("config.json", "outcome.json", "log.jsonl")),
 )  # fmt: skip
-COMMANDS = (("study", "status"), ("study", "extend", "--stage", "random", "--trials", "1"), ("report",))
+COMMANDS = (
+    ("study", "status"),
+    ("study", "extend", "--stage", "random", "--trials", "1"),
+    ("evaluate",),
+    ("rollout",),
+    ("report",),
+)
+OPTIONS = {
+    "evaluate": ("--split", "--horizon", "--task", "--mass", "--particle-spacing", "--frame-dt", "--force"),
+    "rollout": ("--split", "--trajectory", "--start", "--frames", "--mass", "--particle-spacing", "--frame-dt"),
+}
 
 
 def changed_record(data, folder):
@@ -140,6 +151,29 @@ def try_checkpoint(material, flow_folder, data):
         check_call("evaluate", checkpoint, "--data", flow_folder, "--split", "valid", "--json")
 
 
+def try_step(material, steps_folder, data):
+    """A changed checkpoint of steps, rolled out; it may diverge."""
+    name = data.draw(st.sampled_from(["config.json", "card.json"]))
+    content = (material / "step" / name).read_text()
+    with copied(material, "step") as checkpoint:
+        (checkpoint / name).write_bytes(data.draw(changed_json(content)))
+        check_call("rollout", checkpoint, "--data", steps_folder, "--frames", 2, "--json", statuses=(0, 1, 2))
+
+
+def try_options(material, steps_folder, data):
+    """Options of commands on a checkpoint of steps, with values that may be anything."""
+    command = data.draw(st.sampled_from(tuple(OPTIONS)))
+    names = data.draw(st.lists(st.sampled_from(OPTIONS[command]), min_size=1, max_size=2, unique=True))
+    given = [f"{name}={data.draw(numbers.map(str) | strings)}".replace("\x00", "") for name in names]
+    out = ["--out", material / "out"] if command == "rollout" else []
+    try:
+        call = (command, material / "step", "--data", steps_folder, "--json", *out, *given)
+        refused = check_call(*call, statuses=(0, 1, 2)) == 2
+        assert not (refused and (material / "out").exists())
+    finally:
+        shutil.rmtree(material / "out", ignore_errors=True)
+
+
 @examples(40)
 @given(content=changed_toml(STUDY))
 def test_a_changed_study_file_loads_or_is_refused_in_one_line(material, flow_folder, content):
@@ -161,19 +195,31 @@ def test_any_setting_is_taken_or_refused_in_one_line(material, flow_folder, over
 @examples(30)
 @given(data=st.data())
 def test_a_changed_record_is_read_or_refused_in_one_line(material, data):
-    try_record(material, data, COMMANDS[:2])
+    try_record(material, data, COMMANDS[:-1])
 
 
 @examples(5)
 @given(data=st.data())
 def test_a_report_of_changed_records_is_written_or_refused_in_one_line(material, data):
-    try_record(material, data, COMMANDS[2:])
+    try_record(material, data, COMMANDS[-1:])
 
 
 @examples(20)
 @given(data=st.data())
 def test_a_changed_checkpoint_evaluates_or_is_refused_in_one_line(material, flow_folder, data):
     try_checkpoint(material, flow_folder, data)
+
+
+@examples(10)
+@given(data=st.data())
+def test_a_changed_step_is_rolled_out_or_refused_in_one_line(material, steps_folder, data):
+    try_step(material, steps_folder, data)
+
+
+@examples(10)
+@given(data=st.data())
+def test_any_option_of_a_checkpoint_is_taken_or_refused_in_one_line(material, steps_folder, data):
+    try_options(material, steps_folder, data)
 
 
 @pytest.mark.slow
@@ -214,3 +260,19 @@ def test_hundreds_of_records(material, data):
 @given(data=st.data())
 def test_a_hundred_checkpoints(material, flow_folder, data):
     try_checkpoint(material, flow_folder, data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(100)
+@given(data=st.data())
+def test_a_hundred_steps(material, steps_folder, data):
+    try_step(material, steps_folder, data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@examples(200)
+@given(data=st.data())
+def test_hundreds_of_options(material, steps_folder, data):
+    try_options(material, steps_folder, data)

@@ -9,8 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 from nbclient import NotebookClient
 from processes import PATIENCE
-from summaries import explanation, whole_summary
+from summaries import explanation, rollouts, whole_summary
 
+from cconv.study.records.rollouts import write_rollouts
 from cconv.study.records.run_folder import RunFolder
 
 ANALYSIS = Path(__file__).parents[1] / "analysis"
@@ -43,6 +44,8 @@ def whole_run(tmp_path):
     run.write_summary(summary)
     for model in summary.explained:
         np.savez(run.path / "explanation" / f"{model}.npz", **explanation())
+    for model in summary.rolled:
+        write_rollouts(run, model, rollouts(ended="diverged: particles clumped"))
     return run
 
 
@@ -52,13 +55,14 @@ def whole_run(tmp_path):
 def test_a_notebook_shows_charts_and_tables(path, monkeypatch):
     monkeypatch.delenv("CCONV_RUN", raising=False)
     outputs, loaded = execute(path)
-    assert "image/png" in kinds(outputs)
+    assert ("image/png" in kinds(outputs)) == (path.stem != "rollouts")  # of which a study of a field has none
     assert "text/html" in kinds(outputs)
     assert loaded == "[]"
 
 
 @pytest.mark.parametrize(
-    ("name", "charts"), [("search", 4), ("importance", 4), ("finalists", 5), ("stability", 2), ("cost", 2)]
+    ("name", "charts"),
+    [("search", 4), ("importance", 4), ("finalists", 5), ("stability", 2), ("cost", 2), ("rollouts", 3)],
 )
 def test_a_notebook_shows_all_that_was_recorded(name, charts, whole_run, monkeypatch):
     """Its cells in this process, which starts no kernel and draws nothing."""

@@ -3,12 +3,10 @@
 import re
 from pathlib import Path
 
+from systems import untrained_step
+
 import cconv
 from cconv.models.checkpoint import save_model
-from cconv.models.model import build_model
-from cconv.networks import RadialNetSettings
-from cconv.tasks import task_named
-from cconv.tasks.samples import learned_samples
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "docs" / "python.md"]
@@ -16,13 +14,6 @@ CHECKPOINT = "runs/dpi_density_rate/finalists/baseline/seed_1/checkpoint"
 
 
 STEP_CHECKPOINT = "runs/rollout_taylor_green/checkpoint"
-
-
-def untrained_step(folder):
-    """A model of steps with the weights that it begins with."""
-    flow, task = cconv.open_dataset(folder), task_named("acceleration")
-    samples = list(learned_samples(flow, "train", task))
-    return build_model(RadialNetSettings(layers=1), task, task.features, flow.scene, samples)
 
 
 def test_the_code_blocks_run(flow_folder, steps_folder, tmp_path):

@@ -7,14 +7,12 @@ from typing import Annotated
 
 import typer
 
-from cconv.cli.console import errors, results
+from cconv.cli.console import INTERRUPTED, errors, results
 from cconv.cli.data import app as data_app
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.rollout import rollout
 from cconv.cli.study import app as study_app
 from cconv.errors import CConvError, StudyError, is_disk_full, visible
-
-INTERRUPTED = 130
 
 app = typer.Typer(
     name="cconv",

@@ -10,6 +10,8 @@ from rich.text import Text
 
 from cconv.errors import visible
 
+INTERRUPTED = 130  # exit status after Ctrl-C
+
 
 class PlainConsole(Console):
     """A console that shows strings as they are, in tables and live displays too.

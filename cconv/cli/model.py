@@ -113,7 +113,9 @@ def evaluate(
     checkpoint: Annotated[
         Path,
         typer.Argument(
-            metavar="CHECKPOINT", help="Checkpoint folder, e.g. runs/quick/finalists/baseline/seed_1/checkpoint."
+            metavar="CHECKPOINT",
+            help="Checkpoint folder, e.g. runs/quick/finalists/baseline/seed_1/checkpoint, or a run folder: its "
+            "recommended model.",
         ),
     ],
     data: DataPath = None,
@@ -145,6 +147,7 @@ def evaluate(
 
     if horizon is not None:
         check_setting(Horizon, horizon, "--horizon")
+    checkpoint = recommended_checkpoint(checkpoint)
     model, card = load_model(checkpoint, task), read_card(checkpoint)
     if horizon is not None and not isinstance(model.task, StepTask):
         raise ConfigError(f"`--horizon` is for steps, and {model.task.name!r} is a field of one frame; leave it out.")
@@ -243,6 +246,26 @@ def scale_facts(scene: "Scene", config: "ModelConfig") -> dict[str, float | None
     """Give the scales of data and of a model as `other_scales` compares them."""
     found = {name: getattr(scene, name) for name, *_ in TRAINED_AT}
     return found | {f"trained_at_{name}": getattr(config, name) for name, *_ in TRAINED_AT}
+
+
+def recommended_checkpoint(path: Path) -> Path:
+    """Return the checkpoint of the recommended model of a run folder; another folder as it is.
+
+    Raises:
+        ConfigError: If the run has not recommended a model.
+        DataError: If its records are damaged.
+    """
+    from cconv.study.records.run_folder import RunFolder
+
+    if not (path / "study.json").is_file():
+        return path
+    run = RunFolder.open(path)
+    if not run.has_summary:
+        raise ConfigError(
+            f"{path}: the run has not recommended a model yet; continue it (`cconv study resume`), or name a "
+            "checkpoint in it."
+        )
+    return path / run.summary().chosen.checkpoint
 
 
 def report(path: RunPath) -> None:

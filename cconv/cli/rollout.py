@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cconv.cli.console import errors, print_findings, print_json, results, show_progress
+from cconv.cli.console import INTERRUPTED, errors, print_findings, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
-from cconv.cli.model import other_scales, scale_facts
+from cconv.cli.model import other_scales, recommended_checkpoint, scale_facts
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cconv.evaluation.recorded_rollout import RecordedRollout
     from cconv.models.model import ModelConfig
 
-METRICS, ANIMATION = "metrics.json", "rollout.gif"
+METRICS = "metrics.json"
 SOLVER_REPEATS = 3
 MOST_SOLVER_WORK = 10_000_000  # particles times steps of a frame, about 20 s; published sets have up to 800,000
 LONGEST_ANIMATION = 60  # frames; longer rollouts are drawn every few frames
@@ -45,7 +45,7 @@ def rollout(
             "--out",
             metavar="DIR",
             help="Folder to write: the rollout in the LagrangeBench layout (test.h5; the stored frames are train.h5 "
-            f"and valid.h5), {METRICS} and {ANIMATION}.",
+            f"and valid.h5), {METRICS} and rollout.gif; rollout.mp4, too, if ffmpeg is there.",
         ),
     ] = None,
     vtk: Annotated[bool, typer.Option("--vtk", help="Also write VTK files for ParaView, to DIR/vtk.")] = False,
@@ -58,12 +58,14 @@ def rollout(
     """Roll a saved model out by its own answers, and compare it with the stored frames.
 
     The model is given a window of stored frames and predicts the next frame; from that it predicts the one after, and
-    so on. Ctrl-C keeps the frames so far. The exit status is 1 if the rollout diverged.
+    so on. Frames are written as they come: what ends the rollout, such as Ctrl-C or a full disk, keeps those so far.
+    The exit status is 1 if it diverged, 130 after Ctrl-C.
     """
     from cconv.data.plausibility import trajectory_findings
-    from cconv.data.window import window_at
-    from cconv.evaluation.recorded_rollout import record_rollout, rollout_facts, write_rollout
+    from cconv.data.stored_frames import StoredFrames
+    from cconv.evaluation.recorded_rollout import asked_rollout, record_rollout, rollout_facts, write_rollout
     from cconv.models.checkpoint import load_model, read_card
+    from cconv.rollout.rollout import Diverged
     from cconv.study.running.problem import open_card_data
     from cconv.tasks.task import as_step
 
@@ -71,44 +73,34 @@ def rollout(
         raise ConfigError("`--vtk` writes to DIR/vtk and needs `--out DIR`.")
     if frames is not None and frames < 1:
         raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
-    checkpoint = _recommended(checkpoint)
+    checkpoint = recommended_checkpoint(checkpoint)
     model, card = load_model(checkpoint), read_card(checkpoint)
-    history = as_step(model.task).history
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
-    if out is not None:
-        _check_free(out)
-    stored = dataset.trajectory(split, trajectory)
-    present = start + history - 1
-    future = max(1, len(stored) - present - 1) if frames is None else frames
-    recorded = record_rollout(model, window_at(stored, present, history, future), dataset.scene, show_progress)
-    if not len(recorded.positions):
-        raise ConfigError(f"{checkpoint}: no frame was predicted ({recorded.ended}); there is nothing to compare.")
+    stored = StoredFrames(dataset, split, trajectory)
+    asked = asked_rollout(as_step(model.task), stored, dataset.scene, start, frames)
+    try:
+        if out is None:
+            recorded = record_rollout(model, asked, progress=show_progress)
+        else:
+            recorded = write_rollout(model, asked, out, dataset.metadata, progress=show_progress)
+    except Diverged as error:
+        errors.print(f"cconv: {checkpoint}: {error}", style="bold red", soft_wrap=True)
+        raise typer.Exit(1) from error
     _warn_of_scales(dataset.scene, model.config)
     if not is_own:
-        print_findings(trajectory_findings(stored, dataset.scene))
-    if out is not None:
-        write_rollout(out, recorded, dataset)  # first, so that what ends the rest loses no frame
+        print_findings(trajectory_findings(dataset.trajectory(split, trajectory), dataset.scene))
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
-    facts |= {"first_frame": start, "history": history, **rollout_facts(recorded, dataset.scene)}
+    facts |= {"first_frame": start, "history": len(asked.begun), **rollout_facts(recorded)}
     facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:
-        _write_beside(out, recorded, dataset, facts, vtk)
+        _write_beside(out, facts, stored.first_frame + start, vtk)
     if as_json:
         print_json(facts)
     else:
         _print(facts, out)
     if recorded.ended is not None:
-        raise typer.Exit(130 if recorded.ended == "interrupted" else 1)
-
-
-def _recommended(path: Path) -> Path:
-    """Return the checkpoint of the recommended model of a run folder; another folder as it is."""
-    from cconv.study.records.run_folder import RunFolder
-
-    if not (path / "summary.json").is_file():
-        return path
-    return path / RunFolder.open(path).summary().chosen.checkpoint
+        raise typer.Exit(INTERRUPTED if recorded.ended == "interrupted" else 1)
 
 
 def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
@@ -141,26 +133,24 @@ def _warn_of_scales(scene: "Scene", config: "ModelConfig") -> None:
         )
 
 
-def _check_free(out: Path) -> None:
-    from cconv.data.folders import check_free
-
-    check_free(out, (), overwrite=False)
-
-
-def _write_beside(out: Path, recorded: "RecordedRollout", dataset: "Dataset", facts: dict, vtk: bool) -> None:
-    """Write the metrics, an animation and, if asked for, VTK files beside the frames of a rollout."""
+def _write_beside(out: Path, facts: dict, first_frame: int, vtk: bool) -> None:
+    """Write the metrics, animations and, if asked for, VTK files beside the frames of a rollout."""
+    from cconv.data.dataset import open_dataset
+    from cconv.data.folders import whole_file
+    from cconv.data.stored_frames import StoredFrames
     from cconv.data.vtk import write_vtk
-    from cconv.evaluation.recorded_rollout import trajectories_of
     from cconv.files import write_json
-    from cconv.report.particles import write_animation
+    from cconv.report.particles import animation_suffixes
+    from cconv.report.rollout_animation import animate
 
-    write_json(out / METRICS, facts)
-    both = trajectories_of(recorded, dataset.scene)
-    frames = range(0, len(both["rollout"]), math.ceil(len(both["rollout"]) / LONGEST_ANIMATION))
+    with whole_file(out / METRICS) as partial:
+        write_json(partial, facts)
     if vtk:
-        write_vtk(out / "vtk", both["rollout"], dataset.scene, range(len(both["rollout"])), False, show_progress)
-    if dataset.scene.dim > 1:
-        write_animation(out / ANIMATION, both, dataset.scene, frames, "speed", show_progress)
+        written = open_dataset(out)
+        rolled = StoredFrames(written, "test", 0, first_frame)
+        write_vtk(out / "vtk", rolled, written.scene, range(len(rolled)), False, show_progress)
+    for suffix in animation_suffixes():
+        animate(out, out / f"rollout{suffix}", LONGEST_ANIMATION, first_frame, show_progress)
 
 
 def _print(facts: dict, out: Path | None) -> None:

@@ -39,6 +39,14 @@ class Dataset:
         Raises:
             DataError: If there is no such split or block, or the files are damaged.
         """
+        return self.source.read(*self.block(split, k))
+
+    def block(self, split: str, k: int) -> Block:
+        """Return where block `k` of a split lies, without reading it.
+
+        Raises:
+            DataError: If there is no such split or block.
+        """
         if split not in self.splits:
             raise DataError(
                 f"{self.path}: has no split {split!r}; it has {', '.join(self.splits)}."
@@ -47,7 +55,7 @@ class Dataset:
         blocks = self.splits[split]
         if not 0 <= k < len(blocks):
             raise DataError(f"{self.path}: split {split!r} has {len(blocks)} trajectories, counted from 0; got {k}.")
-        return self.source.read(*blocks[k])
+        return blocks[k]
 
     def trajectories(self, split: str) -> Iterator[Trajectory]:
         """Yield all blocks of a split, one at a time."""

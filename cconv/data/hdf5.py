@@ -169,18 +169,17 @@ def write_dataset(
     with whole_folder(Path(folder), FILES, overwrite) as partial:
         summaries = {}
         for split in SPLITS:
-            summaries[split] = _Summary(scene.box)
+            summaries[split] = Summary(scene.box)
             with h5py.File(partial / f"{split}.h5", "w") as file:
                 for index, trajectory in enumerate(splits.get(split, ())):
                     _write_trajectory(file.create_group(f"{index:05d}"), trajectory, scene)
-                    summaries[split].add(trajectory)
+                    summaries[split].add_trajectory(trajectory)
             if not summaries[split].lengths:
                 raise DataError(f"{folder}: split {split!r} has no trajectory; every split must have at least one.")
-        complete = metadata_from_scene(scene, metadata or {}, _statistics(summaries))
-        (partial / METADATA).write_text(json.dumps(complete, indent=1) + "\n", encoding="utf-8")
+        write_metadata(partial, scene, metadata or {}, summaries)
 
 
-class _Summary:
+class Summary:
     """Counts and step statistics of the fluid particles of trajectories, gathered one trajectory at a time."""
 
     def __init__(self, box: Box):
@@ -189,18 +188,36 @@ class _Summary:
         self.lengths: list[int] = []
         self.num_particles: list[int] = []
 
-    def add(self, trajectory: Trajectory) -> None:
+    def add_trajectory(self, trajectory: Trajectory) -> None:
         """Take in one more trajectory."""
-        fluid = trajectory.positions[:, trajectory.particle_types == ParticleType.FLUID].double()
-        steps = self._box.displacement(fluid[1:], fluid[:-1])
+        self.add_steps(trajectory.positions[:, trajectory.particle_types == ParticleType.FLUID])
+        self.add_length(len(trajectory), trajectory.positions.shape[1])
+
+    def add_steps(self, fluid: Tensor, most: int | None = None) -> None:
+        """Take in the steps between frames of the fluid, and the changes of these steps.
+
+        Args:
+            fluid: Consecutive frames (T, M, D).
+            most: Frames of which steps and changes begin, counted from the first; None for all.
+        """
+        steps = self._box.displacement(fluid[1:].double(), fluid[:-1].double())
         for name, values in (("vel", steps), ("acc", steps.diff(dim=0) if len(steps) else steps)):
-            values = values.flatten(0, 1)
+            values = values[:most].flatten(0, 1)
             self.moments[name].append(torch.stack([torch.ones_like(values), values, values**2]).sum(dim=1))
-        self.lengths.append(len(trajectory))
-        self.num_particles.append(trajectory.positions.shape[1])
+
+    def add_length(self, num_frames: int, num_particles: int) -> None:
+        """Take in how many frames and particles a trajectory has."""
+        self.lengths.append(num_frames)
+        self.num_particles.append(num_particles)
 
 
-def _statistics(summaries: Mapping[str, _Summary]) -> dict:
+def write_metadata(folder: Path, scene: Scene, metadata: Mapping, summaries: Mapping[str, Summary]) -> None:
+    """Write metadata.json of a folder whose splits have these statistics, with further keys."""
+    complete = metadata_from_scene(scene, metadata, _statistics(summaries))
+    (folder / METADATA).write_text(json.dumps(complete, indent=1) + "\n", encoding="utf-8")
+
+
+def _statistics(summaries: Mapping[str, Summary]) -> dict:
     """Keys of metadata.json that follow from trajectories; lengths and steps in frames.
 
     Means and deviations are over all splits, as in the published sets. They are for LagrangeBench; our own networks
@@ -229,11 +246,16 @@ def _mean_and_std(moments: Tensor) -> tuple[list[float], list[float]]:
 
 
 def _write_trajectory(group: h5py.Group, trajectory: Trajectory, scene: Scene) -> None:
-    positions, boundary = trajectory.positions, trajectory.boundary
-    _write(group, "position", positions, by_frame=True)
-    _write(group, "particle_type", trajectory.particle_types)
+    _write(group, "position", trajectory.positions, by_frame=True)
     if scene.velocity_source == STORED:
         _write(group, "velocity", trajectory.velocities, by_frame=True)
+    write_constants(group, trajectory, scene)
+
+
+def write_constants(group: h5py.Group, trajectory: Trajectory, scene: Scene) -> None:
+    """Write the members of a trajectory that are the same in every frame: types, masses, viscosities, walls."""
+    boundary = trajectory.boundary
+    _write(group, "particle_type", trajectory.particle_types)
     if scene.mass_source != default_mass_source(scene.particle_spacing, scene.dim):
         _write(group, "mass", trajectory.masses)
     if trajectory.viscosities is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -122,12 +123,40 @@ class Trajectory:
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
 
-    def time(self, index: int, frame_dt: float) -> float:
-        """Time of a frame since the start of the stored trajectory."""
-        return (self.first_frame + index) * frame_dt
+
+class Frames(Protocol):
+    """Consecutive frames of one simulation, in memory as a `Trajectory` or read when they are asked for.
+
+    Attributes:
+        name: Name of the trajectory in its file or folder.
+        first_frame: Index of the first frame here within the stored trajectory.
+        particle_types: (N,), int64.
+        boundary: Wall points of all frames, or None.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def first_frame(self) -> int: ...
+
+    @property
+    def particle_types(self) -> Tensor: ...
+
+    @property
+    def boundary(self) -> Boundary | None: ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Frame: ...
 
 
-def check_frames(trajectory: Trajectory, frames: Iterable[int]) -> None:
+def time_of(trajectory: Frames, index: int, frame_dt: float) -> float:
+    """Time of a frame since the start of the stored trajectory."""
+    return (trajectory.first_frame + index) * frame_dt
+
+
+def check_frames(trajectory: Frames, frames: Iterable[int]) -> None:
     """Raise `ConfigError` unless there is at least one frame and all are frames of the trajectory, counted from 0."""
     frames, last = list(frames), len(trajectory) - 1
     outside = [index for index in frames if not 0 <= index <= last]

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from cconv.data.folders import whole_folder
 from cconv.data.quantities import density_deviation, speed
-from cconv.data.trajectory import Frame, Scene, Trajectory, check_frames
+from cconv.data.trajectory import Frame, Frames, Scene, check_frames, time_of
 
 
 def write_vtk(
     folder: str | Path,
-    trajectory: Trajectory,
+    trajectory: Frames,
     scene: Scene,
     frames: Sequence[int],
     overwrite: bool = False,
@@ -50,7 +50,7 @@ def write_vtk(
     with whole_folder(folder, [series, *names.values(), *older], overwrite) as partial:
         for k in progress(frames, "vtk"):
             _mesh(trajectory[k], scene).write(partial / names[k])
-        files = [{"name": names[k], "time": trajectory.time(k, scene.frame_dt)} for k in frames]
+        files = [{"name": names[k], "time": time_of(trajectory, k, scene.frame_dt)} for k in frames]
         content = json.dumps({"file-series-version": "1.0", "files": files}, indent=1)
         (partial / series).write_text(content + "\n", encoding="utf-8")
     return folder / series

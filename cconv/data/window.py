@@ -88,12 +88,8 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
     Raises:
         DataError: If the trajectory does not have all these frames.
     """
+    check_window(trajectory.name, len(trajectory), present, history, future)
     first, stop = present - history + 1, present + 1 + future
-    if not 0 <= first < stop <= len(trajectory):
-        raise DataError(
-            f"trajectory {trajectory.name}: has {len(trajectory)} frames, and a window of {history} up to frame "
-            f"{present} and {future} after it needs frames {first} to {stop - 1}; ask for fewer or another start."
-        )
     return Window(
         positions=trajectory.positions[first : present + 1],
         future=trajectory.positions[present + 1 : stop],
@@ -103,6 +99,20 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
         trajectory=trajectory.name,
         frame=trajectory.first_frame + present,
     )
+
+
+def check_window(trajectory: str, frames: int, present: int, history: int, future: int) -> None:
+    """Check that a trajectory of so many frames has a window; arguments as of `window_at`.
+
+    Raises:
+        DataError: If it does not have all its frames.
+    """
+    first, stop = present - history + 1, present + 1 + future
+    if not 0 <= first < stop <= frames:
+        raise DataError(
+            f"trajectory {trajectory}: has {frames} frames, and a window of {history} up to frame {present} and "
+            f"{future} after it needs frames {first} to {stop - 1}; ask for fewer or another start."
+        )
 
 
 def check_length(trajectory: str, frames: int, history: int, future: int) -> None:

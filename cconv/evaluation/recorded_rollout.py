@@ -1,145 +1,209 @@
-"""A rollout from a stored window, with its time per frame, kept as far as it came."""
+"""A rollout beside the stored frames, measured as it goes and handed on frame by frame; none of it stays in memory."""
 
+import itertools
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from cconv.data.dataset import Dataset
-from cconv.data.hdf5 import write_dataset
-from cconv.data.trajectory import Scene, Trajectory, finite_difference_velocities
-from cconv.data.window import Window
-from cconv.evaluation.rollout_comparison import check_masses, rollout_metrics
+from cconv.data.growing import growing_dataset
+from cconv.data.metadata import DIFFERENCES
+from cconv.data.stored_frames import StoredFrames
+from cconv.data.trajectory import Scene, Trajectory
+from cconv.data.window import Window, check_window, window_at
+from cconv.evaluation.rollout_comparison import RolloutMeter, RolloutMetrics, check_masses, speed_edges
 from cconv.models.model import Model
 from cconv.rollout.rollout import Diverged, rollout
+from cconv.tasks.task import StepTask
 
-DIFFERENCES = "central differences of positions"
 LENGTHS = (1, 5, 10, 20, 50, 100, 200, 400)  # frames n of MSE_n, as in LagrangeBench
+STRIDE = 10  # frames from one that is looked at to the next
 MOST_SINKHORN = 4  # frames: one takes seconds
 WARM_UP = 2  # frames at the start whose time does not count
+
+Keep = Callable[[Tensor, Tensor], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedRollout:
-    """The frames of a rollout as far as it came, and those that are stored for the same times.
+    """What was measured of a rollout, as far as it came.
 
     Attributes:
         start: Window that it began with.
-        positions: Frames after the start, (T, N, D).
-        milliseconds: Time of each, (T,).
+        frames: Number of frames after the start.
+        milliseconds: Time of each, (frames,).
+        metrics: Metrics of the frames.
         ended: Why it ended before its last frame; None if it did not.
     """
 
     start: Window
-    positions: Tensor
+    frames: int
     milliseconds: np.ndarray
+    metrics: RolloutMetrics
     ended: str | None
-
-    @property
-    def reference(self) -> Tensor:
-        """Stored frames of the same times, (T, N, D)."""
-        return self.start.future[: len(self.positions)]
 
     @property
     def milliseconds_per_frame(self) -> float:
         """Median time of a frame after the first ones."""
-        return float(np.median(self.milliseconds[WARM_UP:] if len(self.milliseconds) > WARM_UP else self.milliseconds))
+        return float(np.median(self.milliseconds[WARM_UP:] if self.frames > WARM_UP else self.milliseconds))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """A rollout to record.
+
+    Attributes:
+        begun: The frames that it begins with.
+        stored: Gives the stored frames (N, D) after them, one after another, each time it is called.
+        frames: Number of these frames.
+        scene: Scene of the frames.
+        stride: Frames from one that all metrics look at to the next; squared errors are of every frame.
+        most_sinkhorn: Largest number of frames with a Sinkhorn divergence.
+    """
+
+    begun: Trajectory
+    stored: Callable[[], Iterator[Tensor]]
+    frames: int
+    scene: Scene
+    stride: int = STRIDE
+    most_sinkhorn: int = MOST_SINKHORN
+
+    @property
+    def start(self) -> Window:
+        """The window that the rollout begins with."""
+        return window_at(self.begun, len(self.begun) - 1, len(self.begun), 0)
+
+
+def asked_rollout(
+    task: StepTask, stored: StoredFrames, scene: Scene, start: int = 0, frames: int | None = None
+) -> Asked:
+    """A rollout from a frame of a stored trajectory on.
+
+    Args:
+        task: Task of the model.
+        stored: The trajectory.
+        scene: Its scene.
+        start: First frame of the window that the rollout begins with.
+        frames: Number of frames to predict; None for all that are stored after the window.
+
+    Raises:
+        DataError: If the trajectory does not have all these frames.
+    """
+    first = start + task.history
+    future = max(1, len(stored) - first) if frames is None else frames
+    check_window(stored.name, len(stored), first - 1, task.history, future)
+    return Asked(
+        begun=stored.between(start, first),
+        stored=lambda: (stored[place].positions for place in range(first, first + future)),
+        frames=future,
+        scene=scene,
+    )
 
 
 def record_rollout(
-    model: Model, start: Window, scene: Scene, progress: Callable[[Iterable, str], Iterable] = lambda items, _: items
+    model: Model,
+    asked: Asked,
+    keep: Keep = lambda positions, stored: None,
+    progress: Callable[[Iterable, str], Iterable] = lambda items, _: items,
 ) -> RecordedRollout:
-    """Roll a model out for as many frames as are stored after a window; Ctrl-C keeps the frames so far.
+    """Roll a model out beside the stored frames; Ctrl-C and a divergence end it with the frames so far.
+
+    All stored frames are read before it begins, so that a damaged one is found by then.
+
+    Args:
+        model: The model, of a step task.
+        asked: The rollout.
+        keep: Is handed each frame of the rollout and the stored one, (N, D), e.g. to write them.
+        progress: Wraps the numbers of the frames to show progress, given a label.
 
     Raises:
-        DataError: If the fluid has no mass, without which the rollout could not be measured.
+        DataError: If the fluid has no mass, without which the rollout could not be measured, or a stored frame is
+            damaged.
+        Diverged: If the first frame would not be a state of particles any more.
+        KeyboardInterrupt: If Ctrl-C came before a frame was measured.
     """
-    check_masses(start.masses, start.is_fluid)
-    frames: list[Tensor] = []
+    meter, path = _meter(asked), rollout(model, asked.start, asked.scene)
     times: list[float] = []
     ended = None
-    path = rollout(model, start, scene)
     try:
-        for _ in progress(range(len(start.future)), "rollout"):
+        for _, stored in zip(progress(range(asked.frames), "rollout"), asked.stored(), strict=True):
             before = time.perf_counter()
-            frames.append(next(path).present)
-            times.append(1e3 * (time.perf_counter() - before))
-    except Diverged as error:
-        ended = f"diverged: {error.reason}"
-    except KeyboardInterrupt:
-        ended = "interrupted"
+            positions = next(path).present
+            spent = 1e3 * (time.perf_counter() - before)
+            keep(positions, stored)
+            times.append(spent)
+            meter.add(positions, stored)
+    except (Diverged, KeyboardInterrupt) as error:
+        if not len(meter):
+            raise
+        ended = f"diverged: {error.reason}" if isinstance(error, Diverged) else "interrupted"
     return RecordedRollout(
-        start=start,
-        positions=torch.stack(frames) if frames else start.future[:0],
+        start=asked.start,
+        frames=len(times),
         milliseconds=np.array(times),
+        metrics=meter.metrics(),
         ended=ended,
     )
 
 
-def rollout_facts(recorded: RecordedRollout, scene: Scene, stride: int = 10) -> dict:
-    """Measures of a rollout of at least one frame, by the names of LagrangeBench's and Neural SPH's metrics.
+def write_rollout(
+    model: Model,
+    asked: Asked,
+    folder: Path,
+    metadata: Mapping,
+    keep: Keep = lambda positions, stored: None,
+    progress: Callable[[Iterable, str], Iterable] = lambda items, _: items,
+) -> RecordedRollout:
+    """Record a rollout and write it frame by frame: it is the test split of a folder, what is stored the others.
 
     Args:
-        recorded: The rollout.
-        scene: Its scene.
-        stride: Frames from one that is looked at to the next, at most; squared errors are of every frame, and Sinkhorn
-            divergences of at most `MOST_SINKHORN`.
+        model: The model, of a step task.
+        asked: The rollout.
+        folder: Folder to write, in the LagrangeBench layout; see `growing_dataset`.
+        metadata: Further keys of metadata.json.
+        keep: As for `record_rollout`, as is `progress`.
+
+    Raises:
+        CConvError: As `record_rollout` and `growing_dataset` do.
     """
-    last, start = recorded.start.present[None].double(), recorded.start
-    count = len(recorded.positions)
-    stride = min(stride, count)
-    metrics = rollout_metrics(
-        torch.cat([last, recorded.positions.double()]),
-        torch.cat([last, recorded.reference.double()]),
+    scene, dtype = replace(asked.scene, velocity_source=DIFFERENCES), asked.begun.positions.dtype
+    with growing_dataset(folder, scene, asked.begun, metadata) as growing:
+
+        def write(positions: Tensor, stored: Tensor) -> None:
+            growing.append({"train": stored, "valid": stored, "test": positions.to(dtype)})
+            keep(positions, stored)
+
+        return record_rollout(model, asked, write, progress)
+
+
+def _meter(asked: Asked) -> RolloutMeter:
+    """Make what measures a rollout."""
+    start, stride = asked.start, min(asked.stride, asked.frames)
+    check_masses(start.masses, start.is_fluid)
+    stored = itertools.chain([start.present], asked.stored())
+    return RolloutMeter(
+        start.present,
         start.masses,
         start.is_fluid,
-        scene,
+        asked.scene,
         stride=stride,
-        sinkhorn_stride=math.ceil(count // stride / MOST_SINKHORN),
+        sinkhorn_stride=math.ceil(asked.frames // stride / asked.most_sinkhorn) if asked.most_sinkhorn else 0,
+        speed_edges=speed_edges(stored, start.is_fluid, asked.scene, stride),
     )
+
+
+def rollout_facts(recorded: RecordedRollout) -> dict:
+    """Measures of a rollout, by the names of LagrangeBench's and Neural SPH's metrics."""
+    metrics = recorded.metrics
+    count = len(metrics.mse)
     return {
-        "frames": count,
+        "frames": recorded.frames,
         "ended": recorded.ended,
         "milliseconds_per_frame": recorded.milliseconds_per_frame,
         "mse_n": {str(n): float(metrics.mse[:n].mean()) for n in sorted({*LENGTHS, count}) if n <= count},
         "metrics": metrics.as_dict(),
     }
-
-
-def trajectories_of(recorded: RecordedRollout, scene: Scene) -> dict[str, Trajectory]:
-    """The stored frames and those of the rollout as trajectories that begin with the same window."""
-    past = recorded.start.positions
-    return {
-        "reference": _trajectory(recorded, torch.cat([past, recorded.reference]), scene),
-        "rollout": _trajectory(recorded, torch.cat([past, recorded.positions.to(past.dtype)]), scene),
-    }
-
-
-def _trajectory(recorded: RecordedRollout, positions: Tensor, scene: Scene) -> Trajectory:
-    start = recorded.start
-    return Trajectory(
-        name=start.trajectory,
-        first_frame=start.frame - len(start.positions) + 1,
-        positions=positions,
-        velocities=finite_difference_velocities(positions, scene.frame_dt, scene.box),
-        masses=start.masses,
-        particle_types=start.particle_types,
-        boundary=start.boundary,
-    )
-
-
-def write_rollout(folder: Path, recorded: RecordedRollout, dataset: Dataset) -> None:
-    """Write a rollout in the LagrangeBench layout: the rollout is the test split, the stored frames are the others.
-
-    Raises:
-        ConfigError: If the folder exists and is not empty, or cannot be written.
-    """
-    scene = replace(dataset.scene, velocity_source=DIFFERENCES)
-    both = trajectories_of(recorded, scene)
-    splits = {"train": [both["reference"]], "valid": [both["reference"]], "test": [both["rollout"]]}
-    write_dataset(folder, scene, splits, dataset.metadata)

@@ -1,8 +1,11 @@
 """All metrics of a rollout beside the stored frames, as series that can be written as JSON."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy.stats import wasserstein_distance
 from torch import Tensor
 
@@ -138,51 +141,181 @@ def rollout_metrics(
         raise ConfigError(f"`stride` must be from 1 to the {len(positions) - 1} frames of the rollout, got {stride}.")
     if sinkhorn_stride < 1:
         raise ConfigError(f"`sinkhorn_stride` must be at least 1, got {sinkhorn_stride}.")
-    frames = np.arange(stride, len(positions), stride)
-    check_masses(masses, is_fluid)
-    both = positions.double(), reference.double()
-    fluid = [path[:, is_fluid] for path in both]
-    moving = [speeds(path, scene.box, scene.frame_dt)[frames - 1].numpy() for path in fluid]
-    edges = np.linspace(0, float(moving[1].max()) or 1.0, SPEED_BINS + 1)
-    found, stored = (
-        _flow_metrics(path, masses.double(), is_fluid, scene, frames, [speed_histogram(each, edges) for each in paces])
-        for path, paces in zip(both, moving, strict=True)
+    meter = RolloutMeter(
+        positions[0],
+        masses,
+        is_fluid,
+        scene,
+        stride=stride,
+        sinkhorn_stride=sinkhorn_stride,
+        speed_edges=speed_edges(reference, is_fluid, scene, stride),
+        most_points=most_points,
     )
-    pairs = {int(frame): (fluid[0][frame], fluid[1][frame], scene.box) for frame in frames}
-    transported = frames[::sinkhorn_stride]
-    return RolloutMetrics(
-        frames=frames,
-        mse=squared_errors(*both, scene.box)[1:].numpy(),
-        e_kin_mse=np.square(found.e_kin - stored.e_kin),
-        chamfer=np.array([chamfer_distance(*pair) for pair in pairs.values()]),
-        sinkhorn_frames=transported,
-        sinkhorn=np.array([sinkhorn_divergence(*pairs[frame], most_points=most_points) for frame in transported]),
-        neighbors_distance=np.abs(found.neighbors - stored.neighbors).sum(axis=1) / 2,
-        speeds_distance=np.array([wasserstein_distance(*each) for each in zip(*moving, strict=True)]),
-        speed_edges=edges,
-        rollout=found,
-        reference=stored,
-    )
+    for frames in zip(positions[1:], reference[1:], strict=True):
+        meter.add(*frames)
+    return meter.metrics()
 
 
-def _flow_metrics(
-    path: Tensor, masses: Tensor, is_fluid: Tensor, scene: Scene, frames: np.ndarray, histograms: list[np.ndarray]
-) -> FlowMetrics:
-    """Measures of a path (T + 1, N, D) at some frames, with the histograms of speeds there."""
-    spacing, fluid = scene.particle_spacing, path[:, is_fluid]
-    volumes = masses / masses[is_fluid].mean() * spacing**scene.dim
-    around = [surroundings(path[frame], volumes, scene.box, spacing).of(is_fluid) for frame in frames]
-    return FlowMetrics(
-        e_kin=kinetic_energies(fluid, scene.box, spacing, scene.frame_dt)[frames - 1].numpy(),
-        momentum_drift=momentum_drift(fluid, masses[is_fluid], scene.box)[frames - 1].numpy(),
-        rho_mae=np.array([density_error(each.densities, FREE_SURFACE) for each in around]),
-        rho_mae_unclamped=np.array([density_error(each.densities) for each in around]),
-        rho_min=np.array([float(each.densities.min()) for each in around]),
-        rho_max=np.array([float(each.densities.max()) for each in around]),
-        dirichlet=np.array([dirichlet_energy(each.gradients, spacing) for each in around]),
-        neighbors=np.stack([neighbor_histogram(each.neighbors) for each in around]),
-        speeds=np.stack(histograms),
-    )
+def speed_edges(reference: Iterable[Tensor], is_fluid: Tensor, scene: Scene, stride: int) -> np.ndarray:
+    """Edges (bins + 1,) of histograms of speeds, from 0 to the largest at the frames that a `RolloutMeter` looks at.
+
+    Args:
+        reference: The stored frame that the rollout begins with and those after it, (N, D) each, read once.
+        is_fluid: Which particles are fluid, (N,), bool.
+        scene: Their scene.
+        stride: Frames from one that is looked at to the next.
+    """
+    largest, before = 0.0, None
+    for number, frame in enumerate(reference):
+        fluid = frame[is_fluid].double()
+        if before is not None and number % stride == 0:
+            largest = max(largest, float(speeds(torch.stack([before, fluid]), scene.box, scene.frame_dt).max()))
+        before = fluid
+    return np.linspace(0, largest or 1.0, SPEED_BINS + 1)
+
+
+class RolloutMeter:
+    """Takes the frames of a rollout and the stored ones as they come, and gives their metrics; it keeps no frames.
+
+    Args:
+        first: The frame that the rollout begins with, (N, D).
+        masses: (N,).
+        is_fluid: Which particles are fluid, (N,), bool.
+        scene: Their scene.
+        stride: Frames from one that is looked at to the next; the squared errors are of every frame.
+        sinkhorn_stride: Of the frames that are looked at, every so many-th has a Sinkhorn divergence; 0 for none.
+        speed_edges: Edges of the bins of speeds, see `speed_edges`.
+        most_points: Limit of `sinkhorn_divergence`.
+
+    Raises:
+        DataError: If the fluid has no mass.
+    """
+
+    def __init__(
+        self,
+        first: Tensor,
+        masses: Tensor,
+        is_fluid: Tensor,
+        scene: Scene,
+        *,
+        stride: int,
+        sinkhorn_stride: int,
+        speed_edges: np.ndarray,
+        most_points: int = MOST_POINTS,
+    ):
+        check_masses(masses, is_fluid)
+        self._masses, self._is_fluid, self._scene = masses.double(), is_fluid, scene
+        self._stride, self._sinkhorn_stride, self._most_points = stride, sinkhorn_stride, most_points
+        self._edges = speed_edges
+        self._paths: tuple[_Path, ...] = (_Path.of(first), _Path.of(first))
+        self._errors: list[float] = []
+        self._looks: list[_Look] = []
+
+    def __len__(self) -> int:
+        """Frames that were taken."""
+        return len(self._errors)
+
+    def add(self, positions: Tensor, stored: Tensor) -> None:
+        """Take the next frame of the rollout and the stored one, (N, D) each."""
+        paths = tuple(path.followed_by(frame) for path, frame in zip(self._paths, (positions, stored), strict=True))
+        error = float(squared_errors(paths[0].now[None], paths[1].now[None], self._scene.box))
+        looks = [self._look(paths, len(self) + 1)] if (len(self) + 1) % self._stride == 0 else []
+        self._paths = paths
+        self._errors.append(error)
+        self._looks += looks
+
+    def metrics(self) -> RolloutMetrics:
+        """Metrics of the frames so far, of which there is at least one; of the last where none was looked at."""
+        looks = self._looks or [self._look(self._paths, len(self))]
+        transported = [look for look in looks if look.sinkhorn is not None]
+        found, stored = (_series([look.flows[side] for look in looks]) for side in (0, 1))
+        return RolloutMetrics(
+            frames=np.array([look.frame for look in looks]),
+            mse=np.array(self._errors),
+            e_kin_mse=np.square(found.e_kin - stored.e_kin),
+            chamfer=np.array([look.chamfer for look in looks]),
+            sinkhorn_frames=np.array([look.frame for look in transported], dtype=int),
+            sinkhorn=np.array([look.sinkhorn for look in transported]),
+            neighbors_distance=np.abs(found.neighbors - stored.neighbors).sum(axis=1) / 2,
+            speeds_distance=np.array([look.speeds_distance for look in looks]),
+            speed_edges=self._edges,
+            rollout=found,
+            reference=stored,
+        )
+
+    def _look(self, paths: "tuple[_Path, ...]", frame: int) -> "_Look":
+        """Measure the last frame of both paths."""
+        scene, fluid = self._scene, [path.of_particles(self._is_fluid) for path in paths]
+        moving = [speeds(torch.stack([path.before, path.now]), scene.box, scene.frame_dt)[0].numpy() for path in fluid]
+        pair, wanted = (fluid[0].now, fluid[1].now, scene.box), self._sinkhorn_stride
+        transports = wanted > 0 and len(self._looks) % wanted == 0
+        return _Look(
+            frame=frame,
+            chamfer=chamfer_distance(*pair),
+            sinkhorn=sinkhorn_divergence(*pair, most_points=self._most_points) if transports else None,
+            speeds_distance=wasserstein_distance(*moving),
+            flows=tuple(
+                self._flow(path, of_fluid) | {"speeds": speed_histogram(pace, self._edges)}
+                for path, of_fluid, pace in zip(paths, fluid, moving, strict=True)
+            ),
+        )
+
+    def _flow(self, path: "_Path", fluid: "_Path") -> dict[str, Any]:
+        """Measures of the last frame of a path, by their names in `FlowMetrics`, without the speeds."""
+        scene, is_fluid, spacing = self._scene, self._is_fluid, self._scene.particle_spacing
+        volumes = self._masses / self._masses[is_fluid].mean() * spacing**scene.dim
+        around = surroundings(path.now, volumes, scene.box, spacing).of(is_fluid)
+        last = torch.stack([fluid.before, fluid.now])
+        since = torch.stack([fluid.first, fluid.second, fluid.before, fluid.now])
+        return {
+            "e_kin": float(kinetic_energies(last, scene.box, spacing, scene.frame_dt)),
+            "momentum_drift": float(momentum_drift(since, self._masses[is_fluid], scene.box)[-1]),
+            "rho_mae": density_error(around.densities, FREE_SURFACE),
+            "rho_mae_unclamped": density_error(around.densities),
+            "rho_min": float(around.densities.min()),
+            "rho_max": float(around.densities.max()),
+            "dirichlet": dirichlet_energy(around.gradients, spacing),
+            "neighbors": neighbor_histogram(around.neighbors),
+        }
+
+
+class _Path(NamedTuple):
+    """The frames (N, D) of a path that its measures need: the first two, and the last two."""
+
+    first: Tensor
+    second: Tensor
+    before: Tensor
+    now: Tensor
+
+    @classmethod
+    def of(cls, first: Tensor) -> "_Path":
+        """The path of a single frame."""
+        return cls(*[first.double()] * 4)
+
+    def followed_by(self, frame: Tensor) -> "_Path":
+        """The path a frame later."""
+        frame = frame.double()
+        second = frame if self.second is self.first else self.second
+        return _Path(self.first, second, self.now, frame)
+
+    def of_particles(self, chosen: Tensor) -> "_Path":
+        """The path of some particles."""
+        return _Path(*(frame[chosen] for frame in self))
+
+
+class _Look(NamedTuple):
+    """What was measured at a frame; `flows` are the measures of the rollout and of the stored frames."""
+
+    frame: int
+    chamfer: float
+    sinkhorn: float | None
+    speeds_distance: float
+    flows: tuple[dict[str, Any], ...]
+
+
+def _series(flows: Sequence[dict[str, Any]]) -> FlowMetrics:
+    """Measures of a path, frame after frame."""
+    return FlowMetrics(**{name: np.stack([flow[name] for flow in flows]) for name in flows[0]})
 
 
 def _plain(values: dict) -> dict:

@@ -25,7 +25,7 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from cconv.data.folders import whole_file
 from cconv.data.quantities import density_deviation, speed
-from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory, check_frames
+from cconv.data.trajectory import Frame, Frames, ParticleType, Scene, check_frames, time_of
 from cconv.errors import ConfigError, check_choice
 from cconv.forces import ConstantForce, Force
 
@@ -45,7 +45,7 @@ _WALL_COLOR, _BOUNDARY_COLOR = "#b3b3b3", "#cccccc"
 
 
 def frames_chart(
-    trajectory: Trajectory,
+    trajectory: Frames,
     scene: Scene,
     frames: Sequence[int],
     color: str = "speed",
@@ -65,7 +65,7 @@ def frames_chart(
     """
     coloring = _coloring(color, trajectory, scene, frames, progress)
     stage = _stage(scene)
-    figure, panels = _set_up(stage, coloring, trajectory, scene, len(frames))
+    figure, panels = _set_up(stage, coloring, trajectory, _title(trajectory, scene), len(frames))
     for axes, k in zip(panels, frames, strict=True):
         _draw_frame(axes, stage, coloring, trajectory, scene, k)
     return figure
@@ -84,7 +84,7 @@ def write_picture(figure: Figure, file: str | Path) -> None:
 
 def write_animation(
     file: str | Path,
-    trajectory: Trajectory | Mapping[str, Trajectory],
+    trajectory: Frames | Mapping[str, Frames],
     scene: Scene,
     frames: Sequence[int],
     color: str = "speed",
@@ -105,18 +105,19 @@ def write_animation(
             of range, the colour unknown or the scene 1D.
     """
     writer = animation_writer(file)
-    drawn = {"": trajectory} if isinstance(trajectory, Trajectory) else trajectory
+    drawn = trajectory if isinstance(trajectory, Mapping) else {"": trajectory}
     first, *others = drawn.values()
     colorings = [_coloring(color, first, scene, frames, progress)]
     colorings += [_coloring(color, other, scene, frames, progress).as_in(colorings[0]) for other in others]
     stage = _stage(scene)
-    figure, panels = _set_up(stage, colorings[0], first, scene, len(drawn))
+    title = scene.name if others else _title(first, scene)
+    figure, panels = _set_up(stage, colorings[0], first, title, len(drawn))
     dpi = ANIMATION_DPI if len(drawn) == 1 else SIDE_BY_SIDE_DPI
     with whole_file(Path(file)) as partial, writer.saving(figure, partial, dpi):
         for k in progress(frames, "animation"):
             particles = [
-                _draw_frame(axes, stage, coloring, each, scene, k, title)
-                for axes, coloring, (title, each) in zip(panels, colorings, drawn.items(), strict=True)
+                _draw_frame(axes, stage, coloring, each, scene, k, name)
+                for axes, coloring, (name, each) in zip(panels, colorings, drawn.items(), strict=True)
             ]
             writer.grab_frame()
             for artist in particles:
@@ -127,6 +128,11 @@ def check_picture_name(file: str | Path) -> None:
     """Raise `ConfigError` unless the name ends in .png."""
     if Path(file).suffix.lower() != ".png":
         raise ConfigError(f"{file}: a picture is written as PNG; name a file that ends in .png.")
+
+
+def animation_suffixes() -> tuple[str, ...]:
+    """Suffixes of the animations that can be written here: .gif, and .mp4 where ffmpeg is found."""
+    return (".gif", ".mp4") if FFMpegWriter.isAvailable() else (".gif",)
 
 
 def animation_writer(file: str | Path) -> AbstractMovieWriter:
@@ -203,7 +209,7 @@ class _ByType:
         return self
 
 
-def _by_speed(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByValue:
+def _by_speed(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByValue:
     values = {k: speed(trajectory[k]).double().numpy() for k in frames}
     is_wall = _is_wall(trajectory.particle_types.numpy())
     top, beyond = _limit(values, is_wall, 0.995)
@@ -211,7 +217,7 @@ def _by_speed(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _B
     return _ByValue(values, is_wall, scale, "speed", "max" if beyond else "neither")
 
 
-def _by_density(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByValue:
+def _by_density(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByValue:
     values = {k: 100 * density_deviation(trajectory[k], scene).numpy() for k in frames}
     is_wall = _is_wall(trajectory.particle_types.numpy())
     top, beyond = _limit(values, is_wall, 0.9)
@@ -219,18 +225,18 @@ def _by_density(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> 
     return _ByValue(values, is_wall, scale, "density deviation [%]", "both" if beyond else "neither")
 
 
-def _by_type(trajectory: Trajectory, scene: Scene, frames: Iterable[int]) -> _ByType:
+def _by_type(trajectory: Frames, scene: Scene, frames: Iterable[int]) -> _ByType:
     return _ByType(trajectory.particle_types.numpy(), scene.dim == 2 and trajectory.boundary is not None)
 
 
-COLORINGS: dict[str, Callable[[Trajectory, Scene, Iterable[int]], _Coloring]] = {
+COLORINGS: dict[str, Callable[[Frames, Scene, Iterable[int]], _Coloring]] = {
     "speed": _by_speed,
     "density": _by_density,
     "type": _by_type,
 }
 
 
-def _coloring(color: str, trajectory: Trajectory, scene: Scene, frames: Sequence[int], progress: Progress) -> _Coloring:
+def _coloring(color: str, trajectory: Frames, scene: Scene, frames: Sequence[int], progress: Progress) -> _Coloring:
     check_choice("color", color, COLORINGS)
     check_frames(trajectory, frames)
     return COLORINGS[color](trajectory, scene, progress(frames, color))
@@ -260,7 +266,7 @@ class _Stage(Protocol):
     aspect: float  # width of a panel by its height
     projection: str | None
 
-    def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes, trajectory: Frames) -> None:
         """Limits, labels and what does not move."""
 
     def draw(self, axes: Axes, frame: Frame, colors: np.ndarray) -> Artist:
@@ -276,7 +282,7 @@ class _Plane:
         self._scene = scene
         self.aspect: float = scene.box.lengths[0] / scene.box.lengths[1]
 
-    def prepare(self, axes: Axes, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes, trajectory: Frames) -> None:
         box = self._scene.box
         axes.set(xlim=(box.lower[0], box.upper[0]), ylim=(box.lower[1], box.upper[1]), xlabel="x", ylabel="y")
         axes.set_aspect("equal")
@@ -305,7 +311,7 @@ class _Space:
         self._scene = scene
         self._vertical = _vertical_axis(scene.force)
 
-    def prepare(self, axes: Axes3D, trajectory: Trajectory) -> None:
+    def prepare(self, axes: Axes3D, trajectory: Frames) -> None:
         box = self._scene.box
         for axis, low, high in zip("xyz", box.lower, box.upper, strict=True):
             axes.set(**{f"{axis}lim": (low, high)})
@@ -346,7 +352,7 @@ def _stage(scene: Scene) -> _Stage:
 
 
 def _set_up(
-    stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, count: int
+    stage: _Stage, coloring: _Coloring, trajectory: Frames, title: str, count: int
 ) -> tuple[Figure, list[Axes]]:
     """A figure of `count` panels that lacks only the particles."""
     rows, columns = _grid(count, stage.aspect)
@@ -365,10 +371,14 @@ def _set_up(
         stage.prepare(axes, trajectory)
     if shared:
         _label_outer(panels, columns)
-    figure.suptitle(f"{scene.name}, trajectory {trajectory.name}", fontsize=12)
+    figure.suptitle(title, fontsize=12)
     coloring.draw_key(figure, panels)
     figure.draw_without_rendering()  # places the panels, from which 3D markers take their size
     return figure, panels
+
+
+def _title(trajectory: Frames, scene: Scene) -> str:
+    return f"{scene.name}, trajectory {trajectory.name}"
 
 
 def _grid(count: int, aspect: float) -> tuple[int, int]:
@@ -392,8 +402,8 @@ def _label_outer(panels: Sequence[Axes], columns: int) -> None:
 
 
 def _draw_frame(
-    axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Trajectory, scene: Scene, k: int, title: str = ""
+    axes: Axes, stage: _Stage, coloring: _Coloring, trajectory: Frames, scene: Scene, k: int, title: str = ""
 ) -> Artist:
-    moment = f"frame {trajectory.first_frame + k if title else k}, t = {trajectory.time(k, scene.frame_dt):.4g}"
+    moment = f"frame {trajectory.first_frame + k if title else k}, t = {time_of(trajectory, k, scene.frame_dt):.4g}"
     axes.set_title(f"{title}: {moment}" if title else moment, fontsize=10)
     return stage.draw(axes, trajectory[k], coloring.colors(k))

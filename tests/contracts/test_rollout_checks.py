@@ -9,7 +9,7 @@ from systems import periodic_scene
 
 from cconv.data.trajectory import ParticleType, Trajectory
 from cconv.evaluation.checks import CHECKS
-from cconv.evaluation.checks.rolled import make_rollout_material
+from cconv.evaluation.checks.rolled import SeriesCheck, make_rollout_material
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.task import StepTask
@@ -177,6 +177,24 @@ def test_a_rollout_that_comes_to_its_stored_length_alone_is_told_apart(task):
     findings = in_vortices(task, lambda path, frame: math.nan if frame > FRAMES + 4 else 0.0)
     assert findings["completion", "as long as stored"].passes
     assert not findings["completion", "twice as long"].passes
+
+
+@pytest.mark.parametrize("fault", [heats, drifts, kicks, compresses, pairs_up])
+@pytest.mark.parametrize("task", STEPS)
+def test_the_first_frame_beyond_a_limit_is_that_of_the_finding(task, fault):
+    path, asked = vortices(), task_named(task, history=3)
+    material = material_of(asked, path, torch.zeros(SIDE**2, dtype=torch.int64), SCENE)
+    model = Replay(asked, path, fault)
+    (rolled,) = material.rolled(model)
+    checks = [check for name in asked.checks if isinstance(check := CHECKS[name](material), SeriesCheck)]
+    beyond = [check.first_beyond(rolled.positions, rolled.start) for check in checks]
+    failed = {each.label: each.detail for check in checks for each in check.findings(model) if not each.passes}
+    assert failed
+    assert failed == {
+        label: f"first beyond the limit at frame {frame} after the start"
+        for each in beyond
+        for label, frame in each.items()
+    }
 
 
 @pytest.mark.parametrize("task", STEPS)

@@ -5,11 +5,12 @@ import shutil
 from html.parser import HTMLParser
 
 import pytest
-from summaries import SAMPLE, changed, whole_summary
+from summaries import SAMPLE, changed, rollouts, whole_summary
 
 from cconv.errors import DataError
 from cconv.report.fields import read_explanations
 from cconv.report.page import render_report
+from cconv.study.records.rollouts import write_rollouts
 from cconv.study.records.run_folder import RunFolder
 
 pytestmark = pytest.mark.integration
@@ -69,6 +70,10 @@ def hostile(summary):
 def page(tmp_path):
     run = RunFolder(shutil.copytree(SAMPLE, tmp_path / "run", ignore=shutil.ignore_patterns("explanation")))
     run.write_summary(hostile(whole_summary(run.summary())))
+    for name in run.summary().rolled:
+        found = rollouts(ended=HOSTILE)
+        rolled = [changed(each, trajectory=HOSTILE, beyond={HOSTILE: 1}) for each in found.rolled]
+        write_rollouts(run, name, changed(found, rolled=rolled, lost=(HOSTILE,)))
     study, environment = run.read("study.json"), run.read("environment.json")
     study["data"]["path"] = HOSTILE
     run.write("study.json", study)

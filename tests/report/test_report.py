@@ -5,11 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
-from summaries import SAMPLE, changed, explanation, minimal_summary, whole_summary
+from summaries import SAMPLE, changed, explanation, minimal_summary, rollouts, whole_summary
 
 from cconv.report import page
 from cconv.report.page import render_report, write_report
 from cconv.report.sections import SECTIONS, chart
+from cconv.study.records.rollouts import write_rollouts
 from cconv.study.records.run_folder import RunFolder
 
 pytestmark = pytest.mark.integration
@@ -31,6 +32,8 @@ def whole_run(tmp_path_factory):
     run.write_summary(summary)
     for name in summary.explained:
         np.savez(run.path / "explanation" / f"{name}.npz", **explanation())
+    for name in summary.rolled:
+        write_rollouts(run, name, rollouts())
     return run
 
 

@@ -5,6 +5,8 @@ import json
 import pytest
 from conftest import SMOKE, run_main
 
+from cconv.data.dataset import open_dataset
+from cconv.study.records.rollouts import read_rollouts
 from cconv.study.records.run_folder import RunFolder
 
 pytestmark = pytest.mark.integration
@@ -53,7 +55,33 @@ def test_the_report_speaks_of_rollouts(run):
     assert "analytic SPH" not in page
 
 
-def test_the_recommended_model_of_the_run_is_rolled_out(run, cconv, tmp_path):
+def test_the_recommended_model_of_the_run_is_rolled_out_and_evaluated(run, cconv):
     code, printed, _ = cconv("rollout", run.path, "--frames", 6, "--json")
     assert code in (0, 1)  # a model of six updates may diverge
-    assert json.loads(printed)["checkpoint"].endswith("checkpoint")
+    chosen = str(run.path / run.summary().chosen.checkpoint)
+    assert json.loads(printed)["checkpoint"] == chosen
+    assert json.loads(cconv("evaluate", run.path, "--json")[1])["checkpoint"] == chosen
+
+
+def test_every_training_of_a_finalist_is_rolled_out_over_the_whole_test_trajectory(run):
+    summary = run.summary()
+    assert summary.rolled == tuple(entry.id for entry in summary.finalists)
+    stored = open_dataset(summary.dataset.path).trajectory("test", 0)
+    for entry in summary.finalists:
+        (found,) = read_rollouts(run, [entry.id]).values()
+        assert {each.seed for each in found.rolled} == set(entry.test.by_seed)
+        for each in found.rolled:
+            assert (each.trajectory, each.stored) == (stored.name, len(stored) - 3)
+            assert len(each.mse) == each.stored or each.ended.startswith("diverged")
+            assert sum(each.reference.neighbors) == pytest.approx(1)
+            step = entry.test.measures["first-frame MSE"]
+            assert each.mse[0] <= step * len(entry.test.by_seed) * 1.001
+
+
+def test_the_frames_of_the_first_rollout_of_the_recommended_model_are_kept_and_drawn(run):
+    rolled = open_dataset(run.path / "rollouts" / "recommended")
+    (found,) = read_rollouts(run, [run.summary().recommended.id]).values()
+    assert len(rolled.trajectory("test", 0)) in {3 + len(each.mse) for each in found.rolled}
+    page = (run.path / "report.html").read_text()
+    assert 'src="data:image/gif;base64,R0lGOD' in page
+    assert '<h2 id="rollouts">' in page

@@ -128,6 +128,17 @@ class SeriesCheck(Check[RolloutMaterial, StepModel]):
         found = [self.series(each.positions, each.start) for each in rolled]
         return [self._worst(label, limit, [each[label] for each in found]) for label, limit in self.limits.items()]
 
+    def first_beyond(self, positions: Tensor, start: Window) -> dict[str, int]:
+        """Find the first frame of a rollout, counted from its start, beyond the limit of each quantity that exceeds it.
+
+        Args:
+            positions: The present of the start and the frames of the rollout, (1 + T, N, D).
+            start: The window that it began with, with the stored frames that follow.
+        """
+        found = self.series(positions, start)
+        places = {label: (found[label] > limit).nonzero() for label, limit in self.limits.items()}
+        return {label: self.stride * int(beyond[0]) for label, beyond in places.items() if len(beyond)}
+
     def _stored(self, start: Window) -> Tensor:
         return torch.cat([start.present[None], start.future]).double()
 

@@ -382,6 +382,7 @@ class Selected(StrictModel):
         analytic: Cost of the analytic field; None for a task without one.
         growth: Growth of the times with the number of particles.
         explained: Ids of the finalists whose filters and fields are in ``explanation/``.
+        rolled: Ids of the finalists whose rollouts over test trajectories are in ``rollouts/``; empty for a field.
         trials: Number of trainings, by stage and outcome.
         rungs: Numbers of trials that continued, by search and rung.
         wall_seconds: Duration of the study.
@@ -405,6 +406,7 @@ class Selected(StrictModel):
     analytic: AnalyticCost | None
     growth: Growth
     explained: tuple[Id, ...]
+    rolled: tuple[Id, ...] = ()
     trials: dict[Name, dict[str, Count]]
     rungs: dict[Name, tuple[PassedRung, ...]]
     wall_seconds: NonNegative

@@ -52,6 +52,7 @@ from cconv.study.stages.finalists import (
     finalist_entry,
     retrained_finalists,
 )
+from cconv.study.stages.rolled import record_rollouts
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import Sample, WindowSamples
 from cconv.tasks.task import FieldTask
@@ -116,6 +117,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
         analytic=judged.analytic,
         growth=growth,
         explained=[each.id for each in explained],
+        rolled=record_rollouts(session, finalists, judged.chosen.id),
         trials=_counts(run),
         rungs=_passed_rungs(session),
         wall_seconds=_seconds_before(session, stage) + time.perf_counter() - start,
