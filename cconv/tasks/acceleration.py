@@ -33,7 +33,7 @@ class Acceleration(StepTask):
     output = Kinds(0, 1)
     features = (CONSTANT, DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, VELOCITY, WALLS)
     optional = (DENSITY, PARTICLE_TYPE, ACCELERATIONS, FORCE, WALLS)
-    checks = ("completion", "motion", "packing")
+    checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
     integrator = SemiImplicitEuler()
 
     def unit(self, units: Units) -> float:
