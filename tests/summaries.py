@@ -42,6 +42,8 @@ from cconv.study.records.summary import (
     Selected,
     Selection,
     SizeTime,
+    SolverComparison,
+    SolverPoint,
     Stability,
     Summary,
     TimeCoefficients,
@@ -62,6 +64,7 @@ def minimal_summary(summary: Summary) -> Summary:
     models = {entry.id: summary.growth.models[entry.id] for entry in summary.finalists}
     growth = changed(summary.growth, models=models, exponents={})
     nothing = {"checks": {}, "search_points": (), "cost_model": None, "analytic": None, "explained": (), "rolled": ()}
+    nothing |= {"solver": None}
     return Summary(**selected | nothing | {"growth": growth})
 
 
@@ -91,6 +94,24 @@ def whole_summary(summary: Summary) -> Summary:
         selection=_selection(ids),
         **parts(summary.baseline),
     )
+
+
+def solver_comparison(*errors: float, network_error: float = 1e-4) -> SolverComparison:
+    """Solvers of these errors, the first that of the data at 8 ms, each four times as fast as the one before."""
+    points = [
+        SolverPoint(
+            factor=1.0 + place,
+            num_particles=400 // (1 + place) ** 2,
+            steps=100 // (1 + place),
+            ms_per_frame=8 / 4**place,
+            ms_low=7.5 / 4**place,
+            ms_high=9 / 4**place,
+            error=error,
+            diverged=0.0,
+        )
+        for place, error in enumerate(errors)
+    ]
+    return SolverComparison(points=points, rollouts=4, network_error=network_error)
 
 
 def parts(baseline: str) -> dict:

@@ -44,7 +44,11 @@ def measure_solver(scene: SimulatedScene, start: Window, *, threads: int, repeat
         threads: Number of torch threads.
         repeats: Timed turns, at least 2.
     """
-    state = restart(scene, start).state
+    return measure_state(scene, restart(scene, start).state, threads=threads, repeats=repeats)
+
+
+def measure_state(scene: SimulatedScene, state: ParticleState, *, threads: int, repeats: int) -> SolverCost:
+    """Measure how long the solver takes for the frame after a state; arguments as of `measure_solver`."""
     with torch_threads(threads):
         times = [time_solver(scene, state) for _ in range(repeats + 1)][1:]
     turns = tuple(1e3 * seconds for seconds in times)
@@ -56,7 +60,7 @@ def measure_solver(scene: SimulatedScene, start: Window, *, threads: int, repeat
         turns_ms=turns,
         steps=scene.steps_per_frame,
         threads=threads,
-        num_particles=int(start.is_fluid.sum()),
+        num_particles=int((~state.is_wall).sum()),
     )
 
 

@@ -4,6 +4,8 @@ import seaborn as sns
 
 MARKED = {"recommended": "#2f8f4e", "baseline": "#c44e52", "thesis's best": "#8c564b", "finalist": "#4c72b0"}
 ANALYTIC_COLOR = "#222222"
+SOLVER_COLOR = "#b8860b"
+PUBLISHED_COLOR = "#7f7f7f"
 MEAN_COLOR = "#000000"  # of the line of the mean predictor
 _STAGES = {
     "closed_form": "#8172b3",

@@ -7,36 +7,43 @@ import pandas as pd
 import plotly.graph_objects as go
 import plotly.io
 
-from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, stage_colors
+from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
+from cconv.report.published import published_errors
 from cconv.report.speed_accuracy import error_range
-from cconv.report.tables import MEAN_PREDICTOR, speed_accuracy_table
+from cconv.report.tables import MEAN_PREDICTOR, SOLVER, speed_accuracy_table
 from cconv.study.records.summary import Front, Summary
 
 _SYMBOLS = {"recommended": "star", "baseline": "square", "thesis's best": "diamond", "finalist": "circle"}
 
 
 def interactive_chart(summary: Summary) -> go.Figure:
-    """Error against time per frame, log axes: finalists with intervals, search, front, analytic SPH.
+    """Error against time per frame, log axes: finalists with intervals, search, front, analytic SPH, solvers.
 
     Hovering over a point shows its name, error, interval, time, parameters and all hyperparameters.
     """
     points = speed_accuracy_table(summary)
-    search, finalists, analytic = (points[points["kind"] == kind] for kind in ("search", "finalist", "analytic"))
-    trivial = summary.mean_predictor.test
-    low, high = error_range(points, trivial)
+    kinds = ("search", "finalist", "analytic", "solver")
+    search, finalists, analytic, solvers = (points[points["kind"] == kind] for kind in kinds)
+    trivial, published = summary.mean_predictor.test, published_errors(summary)
+    low, high = error_range(points, trivial, *published.values())
     figure = go.Figure()
     colors = stage_colors(list(search["group"].unique()))
     for stage, trials in search.groupby("group", sort=False):
         figure.add_trace(_search_trace(stage, trials, colors[stage]))
     figure.add_traces(_attainment_traces(summary.front))
     figure.add_trace(_front_trace(finalists))
-    figure.add_trace(_mean_predictor_trace(trivial, points["ms"].min(), points["ms"].max()))
+    ends = [points["ms"].min(), points["ms"].max()]
+    figure.add_trace(_line_trace(f"{MEAN_PREDICTOR}: {trivial:.3g}", trivial, ends, MEAN_COLOR, "dash"))
+    for name, error in published.items():
+        figure.add_trace(_line_trace(f"{name}, published: {error:.3g}", error, ends, PUBLISHED_COLOR, "dot"))
     for group in _SYMBOLS:
         members = finalists[finalists["group"] == group]
         if not members.empty:
             figure.add_trace(_finalists_trace(group, members))
     if not analytic.empty:
         figure.add_trace(_analytic_trace(analytic, low))
+    if not solvers.empty:
+        figure.add_trace(_solvers_trace(solvers))
     figure.update_xaxes(title="time per frame [ms]", type="log")
     figure.update_yaxes(title=f"error ({summary.task.error})", type="log", dtick=1, exponentformat="power")
     figure.update_yaxes(range=[math.log10(low), math.log10(high)])
@@ -89,10 +96,10 @@ def _front_trace(finalists: pd.DataFrame) -> go.Scatter:
     )
 
 
-def _mean_predictor_trace(error: float, low: float, high: float) -> go.Scatter:
-    line = {"color": MEAN_COLOR, "width": 1.5, "dash": "dash"}
-    name = f"{MEAN_PREDICTOR}: {error:.3g}"
-    return go.Scatter(x=[low, high], y=[error, error], mode="lines", line=line, name=name, hoverinfo="skip")
+def _line_trace(name: str, error: float, ends: list[float], color: str, dash: str) -> go.Scatter:
+    """A line across the chart at an error that belongs to no time."""
+    line = {"color": color, "width": 1.5, "dash": dash}
+    return go.Scatter(x=ends, y=[error, error], mode="lines", line=line, name=name, hoverinfo="skip")
 
 
 def _finalists_trace(group: str, members: pd.DataFrame) -> go.Scatter:
@@ -124,6 +131,18 @@ def _analytic_trace(analytic: pd.DataFrame, edge: float) -> go.Scatter:
         x=analytic["ms"], y=[edge] * len(analytic), mode="markers+text", name=analytic["name"].iloc[0],
         text=analytic["name"], textposition="top center", cliponaxis=False, hovertext=text, hoverinfo="text",
         marker={"symbol": "triangle-up", "size": 14, "color": ANALYTIC_COLOR}, showlegend=False,
+    )  # fmt: skip
+
+
+def _solvers_trace(solvers: pd.DataFrame) -> go.Scatter:
+    text = [
+        f"<b>{row.name}</b><br>error {row.error:.4g}"
+        f"<br>{row.ms:.3g} ms per frame ({row.ms_low:.3g} to {row.ms_high:.3g})"
+        for row in solvers.itertuples(index=False)
+    ]
+    return go.Scatter(
+        x=solvers["ms"], y=solvers["error"], mode="lines+markers", name=SOLVER, hovertext=text, hoverinfo="text",
+        marker={"symbol": "cross", "size": 12, "color": SOLVER_COLOR}, line={"color": SOLVER_COLOR, "width": 1},
     )  # fmt: skip
 
 

@@ -12,21 +12,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
-from cconv.report.colors import ANALYTIC_COLOR, MARKED, stage_colors
+from cconv.report.colors import ANALYTIC_COLOR, MARKED, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
 from cconv.report.plots import mark_mean_predictor, new_figure
-from cconv.report.tables import ANALYTIC, speed_accuracy_table
+from cconv.report.published import published_errors
+from cconv.report.tables import ANALYTIC, SOLVER, speed_accuracy_table
 from cconv.study.records.summary import Summary
 
 _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
 
 
 def speed_accuracy_chart(summary: Summary) -> Figure:
-    """Error against time per frame, log axes: finalists, search, front, analytic SPH.
+    """Error against time per frame, log axes: finalists, search, front, analytic SPH, the solver that made the data.
 
     Vertical bars are 95 % intervals over seeds and test units, where there are enough for one; horizontal bars are the
     quartiles of the timing. The front was found by validation errors; the dashed line is predicting the mean on the
     test split. Each finalist is named in the margin, at the end of a thin line from its point. Trials of the search
-    have validation errors and mostly estimated times; those that were stopped are hollow.
+    have validation errors and mostly estimated times; those that were stopped are hollow. The solver is drawn with
+    coarser ones, which are cheaper. Dotted lines are errors that others published for the same data; they have no time.
     """
     points = speed_accuracy_table(summary)
     finalists = points[points["kind"] == "finalist"].sort_values("error", ascending=False)
@@ -36,8 +38,11 @@ def speed_accuracy_chart(summary: Summary) -> Figure:
     _draw_front(axes, summary, finalists)
     for row in finalists.itertuples():
         _draw_finalist(axes, row)
+    _draw_solvers(axes, points[points["kind"] == "solver"])
     trivial = summary.mean_predictor.test
-    axes.set_ylim(*error_range(points, trivial))
+    axes.set_ylim(*error_range(points, trivial, *published_errors(summary).values()))
+    for name, error in published_errors(summary).items():
+        axes.axhline(error, color=PUBLISHED_COLOR, lw=0.9, ls=":", zorder=1, label=f"{name}, published: {error:.3g}")
     mark_mean_predictor(axes.axhline, trivial)
     _draw_analytic(axes, points[points["kind"] == "analytic"])
     _name_in_margin(axes, finalists)
@@ -49,13 +54,19 @@ def speed_accuracy_chart(summary: Summary) -> Figure:
     return figure
 
 
-def error_range(points: pd.DataFrame, mean_predictor: float) -> tuple[float, float]:
-    """Lower and upper end of the error axis: all finalists, the mean predictor, trials up to ten times the worst."""
+def error_range(points: pd.DataFrame, mean_predictor: float, *published: float) -> tuple[float, float]:
+    """Lower and upper end of the error axis: all finalists, solvers, the mean predictor, published errors.
+
+    Trials are within it up to ten times the worst finalist.
+    """
     finalists = points[points["kind"] == "finalist"]
     highest = finalists[["error", "error_high"]].max(axis=None)
     errors = points.loc[points["error"].between(0, 10 * highest, inclusive="neither"), "error"]
-    lowest = np.nanmin([errors.min(), finalists["error_low"][finalists["error_low"] > 0].min()])
-    return lowest / 3, 2 * max(errors.max(), highest, mean_predictor)
+    solvers = points.loc[(points["kind"] == "solver") & (points["error"] > 0), "error"]
+    lowest = np.nanmin(
+        [errors.min(), finalists["error_low"][finalists["error_low"] > 0].min(), solvers.min(), *published]
+    )
+    return lowest / 3, 2 * np.nanmax([errors.max(), highest, mean_predictor, solvers.max(), *published])
 
 
 def _draw_search(axes: Axes, search: pd.DataFrame) -> None:
@@ -95,6 +106,22 @@ def _draw_finalist(axes: Axes, row: Any) -> None:
         capsize=3,
         zorder=5,
     )
+
+
+def _draw_solvers(axes: Axes, solvers: pd.DataFrame) -> None:
+    """Draw the solver and coarser ones on a line, each with its name."""
+    if solvers.empty:
+        return
+    axes.plot(solvers["ms"], solvers["error"], "-P", color=SOLVER_COLOR, markersize=8, lw=0.8, zorder=4, label=SOLVER)
+    for row in solvers.itertuples():
+        axes.annotate(
+            row.name,
+            (row.ms, row.error),
+            xytext=(6, 6),
+            textcoords="offset points",
+            fontsize=7.5,
+            color=SOLVER_COLOR,
+        )
 
 
 def _draw_analytic(axes: Axes, analytic: pd.DataFrame) -> None:

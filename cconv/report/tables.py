@@ -10,6 +10,7 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.summary import FinalistEntry, Summary
 
 ANALYTIC = "analytic SPH"
+SOLVER = "SPH solver"
 MEAN_PREDICTOR = "predicting the mean"  # of the training split, always and everywhere
 AUDIT_MEASURES = {"spearman": "rank correlation", "recall": "recall of the best", "regret": "regret"}
 
@@ -100,13 +101,14 @@ def finalists_rows(summary: Summary) -> list[dict]:
 def speed_accuracy_table(summary: Summary) -> pd.DataFrame:
     """One row a point of the speed-accuracy chart.
 
-    Columns: name; kind ("finalist", "search" or "analytic"); group, the stage of a search point or what marks a
-    finalist ("recommended", "baseline", "thesis's best", "finalist"); error, error_low, error_high (of the test split
-    for finalists, of the validation split for search points, 0 for analytic SPH; the interval is empty where there are
-    too few seeds or units for one); ms, ms_low, ms_high per frame; measured, whether the time was measured or
-    estimated; num_parameters; outcome; on_front, by validation errors; hyperparameters, a dict.
+    Columns: name; kind ("finalist", "search", "solver" or "analytic"); group, the stage of a search point or what marks
+    a finalist ("recommended", "baseline", "thesis's best", "finalist"); error, error_low, error_high (of the test split
+    for finalists, of the validation split for search points, of some rollouts of the test split for solvers, 0 for
+    analytic SPH; the interval is empty where there are too few seeds or units for one); ms, ms_low, ms_high per frame;
+    measured, whether the time was measured or estimated; num_parameters; outcome; on_front, by validation errors;
+    hyperparameters, a dict.
     """
-    rows = [*_finalist_points(summary), *_search_points(summary)]
+    rows = [*_finalist_points(summary), *_search_points(summary), *_solver_points(summary)]
     analytic = summary.analytic
     if analytic:
         times = {"ms": analytic.ms_per_frame, "ms_low": analytic.ms_low, "ms_high": analytic.ms_high}
@@ -211,4 +213,19 @@ def _search_points(summary: Summary) -> list[dict]:
             "hyperparameters": point.parameters,
         }
         for point in summary.search_points
+    ]
+
+
+def _solver_points(summary: Summary) -> list[dict]:
+    return [
+        {
+            "name": SOLVER if point.factor == 1 else f"{SOLVER}, {point.factor:.3g} times coarser",
+            "kind": "solver",
+            "group": SOLVER,
+            "error": point.error,
+            "ms": point.ms_per_frame,
+            "ms_low": point.ms_low,
+            "ms_high": point.ms_high,
+        }
+        for point in (summary.solver.points if summary.solver else ())
     ]

@@ -38,7 +38,7 @@ class SolverModel:
         Raises:
             Diverged: If the simulation blows up.
         """
-        if not self._has_reached(frame, scene):
+        if not has_reached(self._reached, frame, scene):
             self._frames = solved_frames(self._simulated, frame)
         try:
             self._reached = next(self._frames)
@@ -47,10 +47,11 @@ class SolverModel:
             raise Diverged(frame.frame + 1, str(error).removesuffix(".")) from error
         return self.task.target(replace(frame, future=self._reached.present[None]), scene)
 
-    def _has_reached(self, frame: Window, scene: Scene) -> bool:
-        last = self._reached
-        if last is None or last.present.shape != frame.present.shape:
-            return False
-        fluid = frame.is_fluid
-        apart = scene.box.displacement(last.present[fluid], frame.present[fluid].double())
-        return bool((apart.abs() < _SAME * scene.particle_spacing).all())
+
+def has_reached(last: Window | None, frame: Window, scene: Scene) -> bool:
+    """Tell whether a window's present is the one that a simulation has led to, None if there is none."""
+    if last is None or last.present.shape != frame.present.shape:
+        return False
+    fluid = frame.is_fluid
+    apart = scene.box.displacement(last.present[fluid], frame.present[fluid].double())
+    return bool((apart.abs() < _SAME * scene.particle_spacing).all())

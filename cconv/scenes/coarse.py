@@ -1,6 +1,7 @@
 """The solver run coarser, the cheap alternative to a model: fewer particles, larger steps, the same flow."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -9,9 +10,13 @@ from torch import Tensor
 from cconv.errors import ConfigError
 from cconv.neighbors import radius_graph
 from cconv.scenes.simulated_scene import SimulatedScene
+from cconv.scenes.walls import lattice
 from cconv.sph.kernels import QuinticSpline
-from cconv.sph.operators import interpolate
+from cconv.sph.operators import density, interpolate
 from cconv.sph.solver import ParticleState
+
+FACTORS = (1.5, 2.0, 3.0, 4.0, 6.0)  # by which scenes are made coarser, as nearly as their lengths allow
+FILLED = 0.5  # share of the rest density above which a place counts as one in the fluid
 
 
 def coarser(scene: SimulatedScene, factor: float) -> SimulatedScene:
@@ -35,6 +40,38 @@ def coarser(scene: SimulatedScene, factor: float) -> SimulatedScene:
     return coarse
 
 
+def coarser_scenes(scene: SimulatedScene) -> Iterator[SimulatedScene]:
+    """Yield the scene at coarser and coarser spacings that divide its shortest length, as far as the solver can go."""
+    shortest = min(_lengths(scene))
+    cells = round(shortest / scene.particle_spacing)
+    for fewer in dict.fromkeys(round(cells / factor) for factor in FACTORS):
+        try:
+            coarse = coarser(scene, shortest / (max(fewer, 1) * scene.particle_spacing))
+            len(coarse.walls)  # a wall may not fit
+        except ConfigError:
+            return
+        yield coarse
+
+
+def coarse_state(scene: SimulatedScene, coarse: SimulatedScene, state: ParticleState) -> ParticleState:
+    """Begin a coarse flow from a state of the finer scene: a lattice where its fluid is, with its velocities.
+
+    Args:
+        scene: The finer scene.
+        coarse: The same scene, coarser.
+        state: Particles of the finer scene.
+    """
+    counts = [round(length / coarse.particle_spacing) for length in _lengths(scene)]
+    places = lattice(counts, coarse.particle_spacing, scene.corner)
+    fluid = ~state.is_wall
+    kernel = QuinticSpline(scene.particle_spacing, scene.dim)
+    edges = radius_graph(state.positions[fluid], kernel.support_radius, scene.box, queries=places)
+    places = places[density(state.masses[fluid], edges, kernel) > FILLED * scene.rest_density]
+    velocities = _velocities(places, state, kernel, scene)
+    positions = coarse.box.wrap(places + _shift(scene, coarse))
+    return coarse.state_of(coarse.walls, positions, velocities, float(state.viscosities[0]), amid_flow=True)
+
+
 def velocities_at(points: Tensor, scene: SimulatedScene, coarse: SimulatedScene, state: ParticleState) -> Tensor:
     """Velocities (N, D) of a coarse flow at points of a finer scene, by Shepard-normalised SPH interpolation.
 
@@ -47,9 +84,24 @@ def velocities_at(points: Tensor, scene: SimulatedScene, coarse: SimulatedScene,
         coarse: The scene of the state, from `coarser`.
         state: Its particles.
     """
-    shift = torch.tensor(coarse.corner, dtype=torch.float64) - torch.tensor(scene.corner, dtype=torch.float64)
-    kernel, fluid = QuinticSpline(coarse.particle_spacing, coarse.dim), ~state.is_wall
-    places = coarse.box.wrap(points.double() + shift)
-    edges = radius_graph(state.positions[fluid], kernel.support_radius, coarse.box, queries=places)
+    places = coarse.box.wrap(points.double() + _shift(scene, coarse))
+    return _velocities(places, state, QuinticSpline(coarse.particle_spacing, coarse.dim), coarse)
+
+
+def _velocities(places: Tensor, state: ParticleState, kernel: QuinticSpline, scene: SimulatedScene) -> Tensor:
+    """Velocities (M, D) of the fluid of a state at places (M, D) of its scene; zero where none is in reach."""
+    fluid = ~state.is_wall
+    edges = radius_graph(state.positions[fluid], kernel.support_radius, scene.box, queries=places)
     volumes = state.masses[fluid] / state.densities[fluid]
     return torch.nan_to_num(interpolate(state.velocities[fluid], volumes, edges, kernel), nan=0.0)
+
+
+def _shift(scene: SimulatedScene, coarse: SimulatedScene) -> Tensor:
+    """What leads from a place of the scene to the same place of the coarse one, (D,): its walls are thicker."""
+    return torch.tensor(coarse.corner, dtype=torch.float64) - torch.tensor(scene.corner, dtype=torch.float64)
+
+
+def _lengths(scene: SimulatedScene) -> list[float]:
+    """Edge lengths of the space within the walls."""
+    corner = zip(scene.box.lengths, scene.corner, scene.box.lower, strict=True)
+    return [length - 2 * (inner - outer) for length, inner, outer in corner]

@@ -51,7 +51,7 @@ class Acceleration(StepTask):
         WALLS,
     )
     optional = (DENSITY, PRESSURE_SOURCE, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
-    checks = ("completion", "motion", "packing")
+    checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
     integrator = SemiImplicitEuler()
 
     def unit(self, units: Units) -> float:

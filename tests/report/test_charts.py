@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from summaries import SAMPLE, changed, explanation, whole_summary
+from summaries import SAMPLE, changed, explanation, solver_comparison, whole_summary
 
 from cconv.report.fields import error_distribution_chart, fields_chart, filters_chart, read_explanations
 from cconv.report.interactive import interactive_chart, interactive_html
@@ -227,3 +227,38 @@ def test_explanations_are_read_by_name_and_never_unpickled(tmp_path):
     np.savez(tmp_path / "explanation" / "evil.npz", harm=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="allow_pickle"):
         read_explanations(run, ["evil"])
+
+
+def beside_the_solver(summary, folder="2D_TGV_2500_10kevery100", horizon=20):
+    """A study of a step on data of a name, with two solvers."""
+    return changed(
+        summary,
+        solver=solver_comparison(1e-6, 2e-4),
+        task=changed(summary.task, horizon=horizon),
+        dataset=changed(summary.dataset, path=f"data/{folder}"),
+    )
+
+
+def test_solvers_are_points_with_names_in_both_charts(summary):
+    summary = beside_the_solver(summary)
+    names = {"SPH solver", "SPH solver, 2 times coarser"}
+    static, interactive = speed_accuracy_chart(summary), interactive_chart(summary)
+    (axes,) = static.axes
+    assert names <= {text.get_text() for text in axes.texts}
+    (trace,) = (trace for trace in interactive.data if trace.name == "SPH solver")
+    assert (list(trace.x), list(trace.y)) == ([8, 2], [1e-6, 2e-4])
+    assert names == {re.match("<b>(.*?)</b>", text)[1] for text in trace.hovertext}
+    assert axes.get_ylim()[0] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("folder", "horizon", "lines"),
+    [("2D_TGV_2500", 20, 2), ("2D_TGV_2500", 5, 0), ("taylor_green_2d", 20, 0), ("2D_TGV_2500", None, 0)],
+)
+def test_published_errors_are_lines_on_lagrangebenchs_data_and_rollouts_of_its_length_alone(
+    folder, horizon, lines, summary
+):
+    given = beside_the_solver(summary, folder, horizon)
+    labels = speed_accuracy_chart(given).axes[0].get_legend_handles_labels()[1]
+    for found in (labels, [trace.name for trace in interactive_chart(given).data]):
+        assert sum("published" in name for name in found if name) == lines

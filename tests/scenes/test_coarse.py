@@ -8,7 +8,7 @@ import torch
 from cconv.data.simulate import next_frame
 from cconv.errors import ConfigError
 from cconv.scenes import SCENES, scene_named
-from cconv.scenes.coarse import coarser, velocities_at
+from cconv.scenes.coarse import coarse_state, coarser, coarser_scenes, velocities_at
 
 
 @pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.dim == 2])
@@ -92,3 +92,29 @@ def test_a_coarse_flow_decays_at_the_analytic_rate_and_half_as_much():
         state = next_frame(coarse, solver, state)
     rate = math.log(energies[0] / energies[-1]) / (25 * coarse.frame_dt)
     assert rate / (16 * math.pi**2 * scene.viscosity) - 1 == pytest.approx(0.52, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["taylor_green_2d", "reverse_poiseuille_2d", "lid_driven_cavity_2d", "dam_break_2d"])
+def test_coarser_and_coarser_scenes_can_all_be_begun_from_the_fine_one(name):
+    """The fluid has the same mass to what a lattice can resolve, and a velocity field that is linear stays so."""
+    scene = scene_named(name, "small", relaxation_steps=5)
+    state = scene.initial_state(torch.Generator().manual_seed(0))
+    fluid = ~state.is_wall
+    state.velocities[fluid] = state.positions[fluid] - torch.tensor(scene.corner, dtype=torch.float64)
+    scenes = list(coarser_scenes(scene))
+    spacings = [each.particle_spacing / scene.particle_spacing for each in scenes]
+    assert spacings
+    assert min(spacings) > 1
+    assert spacings == sorted(set(spacings))
+    for coarse in scenes[:2]:
+        begun = coarse_state(scene, coarse, state)
+        moved = ~begun.is_wall
+        assert float(begun.masses[moved].sum() / state.masses[fluid].sum()) == pytest.approx(1, abs=0.15)
+        places = begun.positions[moved] - torch.tensor(coarse.corner, dtype=torch.float64)
+        middle = ((places - 0.5).abs() < 0.2).all(dim=1)
+        assert middle.any()
+        torch.testing.assert_close(begun.velocities[moved][middle], places[middle], rtol=0, atol=0.3 / 12)
+
+
+def test_no_scene_is_coarser_than_the_solver_can_fill():
+    assert list(coarser_scenes(scene_named("reverse_poiseuille_3d", "small"))) == []

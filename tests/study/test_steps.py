@@ -8,6 +8,7 @@ from conftest import SMOKE, run_main
 from cconv.data.dataset import open_dataset
 from cconv.study.records.rollouts import read_rollouts
 from cconv.study.records.run_folder import RunFolder
+from cconv.tasks import TASKS
 
 pytestmark = pytest.mark.integration
 
@@ -24,11 +25,11 @@ def test_models_are_compared_by_rollouts_and_no_analytic_field(run):
     assert (summary.task.name, summary.task.error) == ("acceleration", "rollout MSE")
     assert summary.analytic is None
     assert summary.explained == ()
-    assert set(summary.checks) == {"completion", "motion", "packing"}
+    assert set(summary.checks) == set(TASKS["acceleration"].checks)
     for entry in summary.finalists:
         assert set(entry.test.measures) == {"first-frame MSE", "diverged rollouts"}
         assert 0 < entry.test.error < 0.25
-        assert entry.stability.counts.plain_frames == 1
+        assert entry.stability.counts.plain_frames == 1 + 6  # from the start of the trajectory, and from others
 
 
 def test_a_scene_without_walls_and_force_has_no_input_for_them(run):
@@ -46,6 +47,19 @@ def test_models_of_all_histories_are_compared_at_the_same_presents(run, cconv):
         code, printed, _ = cconv("evaluate", run.path / entry.checkpoint, "--split", "valid", "--json")
         assert code == 0
         assert json.loads(printed)["rollout_mse"] == pytest.approx(card["valid_error"], rel=1e-3)
+
+
+def test_the_solver_that_made_the_data_stands_beside_the_networks(run):
+    summary = run.summary()
+    solver, *coarser = summary.solver.points
+    assert summary.solver.why_none == ""
+    assert summary.task.horizon == 5
+    assert solver.factor == 1
+    assert solver.error < summary.mean_predictor.test
+    assert all(coarse.num_particles < solver.num_particles for coarse in coarser)
+    assert all(point.ms_per_frame > summary.chosen.cost.ms_per_frame for point in summary.solver.points[:-1])
+    page = (run.path / "report.html").read_text()
+    assert "the solver that made the data, restarted from the same frames, errs by" in " ".join(page.split())
 
 
 def test_the_report_speaks_of_rollouts(run):

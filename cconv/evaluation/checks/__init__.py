@@ -11,9 +11,12 @@ from cconv.data.trajectory import Scene, Trajectory
 from cconv.evaluation.checks.check import Check
 from cconv.evaluation.checks.completion import Completion
 from cconv.evaluation.checks.density import IntegratedDensity
+from cconv.evaluation.checks.later_start import LaterStart
+from cconv.evaluation.checks.mapped_starts import MappedStarts
 from cconv.evaluation.checks.material import Material, make_material
 from cconv.evaluation.checks.motion import Motion
 from cconv.evaluation.checks.packing import Packing
+from cconv.evaluation.checks.perturbed_starts import PerturbedStarts
 from cconv.evaluation.checks.precision import Precision
 from cconv.evaluation.checks.regimes import Regimes
 from cconv.evaluation.checks.rolled import RolloutMaterial, make_rollout_material
@@ -22,7 +25,7 @@ from cconv.evaluation.checks.stress import StressedStates
 from cconv.tasks.task import StepTask, Task, as_field
 
 _OF_FIELDS = (Regimes, StressedStates, StillStates, Precision, IntegratedDensity)
-_OF_STEPS = (Completion, Motion, Packing)
+_OF_STEPS = (Completion, Motion, Packing, PerturbedStarts, MappedStarts, LaterStart)
 CHECKS: dict[str, type[Check[Any, Any]]] = {check.name: check for check in (*_OF_FIELDS, *_OF_STEPS)}
 
 

@@ -5,9 +5,8 @@ from torch import Tensor
 
 from cconv.data.trajectory import ParticleType
 from cconv.data.window import Window
-from cconv.evaluation.checks.rolled import Bound, SeriesCheck
+from cconv.evaluation.checks.rolled import Bound, SeriesCheck, relative_densities
 from cconv.neighbors import Edges, radius_graph
-from cconv.sph.operators import density
 
 NEAR = 3.0  # particle spacings within which nearest neighbours are searched
 TOO_NEAR = 0.5  # particle spacings from a wall at which a particle counts as one that penetrates it
@@ -41,9 +40,7 @@ class Packing(SeriesCheck):
         scene, task, fluid = self.material.scene, self.material.task, start.is_fluid
         kernel = task.kernel_at(scene.particle_spacing, scene.dim)
         edges = radius_graph(positions, max(kernel.support_radius, NEAR * scene.particle_spacing), scene.box)
-        masses = start.masses.double()
-        rest = float(masses[fluid].mean()) / scene.particle_spacing**scene.dim
-        densities = density(masses, edges, kernel)[fluid] / rest
+        densities = relative_densities(start, edges, kernel, scene)
         nearest = torch.full((len(positions),), edges.cutoff, dtype=torch.float64)
         nearest.scatter_reduce_(0, edges.receivers.long(), edges.distances, "amin")
         found = {

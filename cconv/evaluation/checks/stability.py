@@ -21,8 +21,9 @@ def measure_stability(seeds: Mapping[str, Any], checks: Sequence[Check], counts:
         and of what was looked at.
     """
     findings, failures = [], []
-    for check in checks:
-        found = {name: check.findings(predictor) for name, predictor in seeds.items()}
+    of_seeds = {name: [check.findings(predictor) for check in checks] for name, predictor in seeds.items()}
+    for place, check in enumerate(checks):
+        found = {name: of_checks[place] for name, of_checks in of_seeds.items()}
         worst = [max(same, key=lambda each: each.value) for same in zip(*found.values(), strict=True)]
         findings += [asdict(finding) for finding in worst]
         failures += _failures(check, found, worst)

@@ -1,9 +1,9 @@
-"""The answer: the recommended model and its figures, compared with the baseline and the analytic field."""
+"""The answer: the recommended model and its figures, compared with the baseline, the analytic field and the solver."""
 
 from typing import Any
 
 from cconv.report.sections.section import Records, Section
-from cconv.study.records.summary import FinalistEntry, Summary
+from cconv.study.records.summary import FinalistEntry, SolverComparison, Summary
 
 
 class AnswerSection(Section):
@@ -21,6 +21,7 @@ class AnswerSection(Section):
             "reason": _lead(summary.recommended.reason),
             "baseline": other,
             "ratios": {} if other is None else _ratios(other, summary.chosen),
+            "solver": _beside_the_solver(summary.solver, summary.chosen.cost.ms_per_frame) if summary.solver else "",
         }
 
 
@@ -37,3 +38,28 @@ def _ratios(baseline: FinalistEntry, chosen: FinalistEntry) -> dict[str, float |
         "time": baseline.cost.ms_per_frame / chosen.cost.ms_per_frame,
         "size": baseline.num_parameters / chosen.num_parameters,
     }
+
+
+def _beside_the_solver(solver: SolverComparison, ms: float) -> str:
+    """Say whether the recommended model, which takes `ms` for a frame, pays beside the solver that made the data."""
+    if not solver.points or solver.network_error is None:
+        return f"The solver that made the data was not measured: {solver.why_none}."
+    full, last, own = solver.points[0], solver.points[-1], solver.network_error
+    figures = (
+        f"On {solver.rollouts} rollout{'s' * (solver.rollouts != 1)} of the test split the solver that made the data, "
+        f"restarted from the same frames, errs by {full.error:.3g} and takes {full.ms_per_frame:.3g} ms for a frame; "
+        f"the recommended network errs by {own:.3g} and takes {ms / full.ms_per_frame:.3g} times as long."
+    )
+    if ms >= full.ms_per_frame:
+        return f"A network does not pay for this scene at this size: it is no faster than the solver. {figures}"
+    if last is full:
+        return f"{figures} The solver cannot be run coarser in this scene."
+    is_as_fast = last.ms_per_frame <= ms
+    coarse = (
+        f"The solver with particles {last.factor:.3g} times as far apart{'' if is_as_fast else ', as far as possible,'}"
+        f" takes {last.ms_per_frame:.3g} ms and errs by {last.error:.3g}."
+    )
+    pays = f"A network pays for this scene where an error of {own:.3g} is small enough."
+    if is_as_fast and last.error <= own:
+        pays = "A network does not pay for this scene: a coarser solver is as fast and no less accurate."
+    return f"{pays} {figures} {coarse}"

@@ -22,6 +22,7 @@ class TaskFacts(StrictModel):
         error_meaning: Explanation of the error.
         measures: Explanation of each further measure, by its name.
         mean_predictor: Explanation of the error of always predicting the mean.
+        horizon: Frames of the rollouts behind the error; None for a field.
     """
 
     name: Name
@@ -31,6 +32,7 @@ class TaskFacts(StrictModel):
     error_meaning: str
     measures: dict[str, str]
     mean_predictor: str = ""
+    horizon: Count | None = None
 
 
 class DatasetFacts(StrictModel):
@@ -360,6 +362,46 @@ class PassedRung(StrictModel):
     passed: Count
 
 
+class SolverPoint(StrictModel):
+    """The solver at one resolution, restarted from the starts of rollouts.
+
+    Attributes:
+        factor: Its particle spacing ÷ that of the data; 1 for the solver that made them.
+        num_particles: Number of its fluid particles.
+        steps: Its steps of a frame.
+        ms_per_frame: Median time of a frame, ms.
+        ms_low: Lower quartile.
+        ms_high: Upper quartile.
+        error: Error of its rollouts.
+        diverged: Share of the rollouts that it did not finish.
+    """
+
+    factor: NonNegative
+    num_particles: Count
+    steps: Count
+    ms_per_frame: NonNegative
+    ms_low: NonNegative
+    ms_high: NonNegative
+    error: NonNegative
+    diverged: NonNegative
+
+
+class SolverComparison(StrictModel):
+    """The solver that made the data beside the recommended model of a step.
+
+    Attributes:
+        points: The solver itself, then coarser and coarser ones; empty if it was not measured.
+        rollouts: Number of rollouts of the test split that it was measured on.
+        network_error: Error of the recommended model on the same rollouts, mean over its seeds; None without points.
+        why_none: The reason why it was not measured, or "".
+    """
+
+    points: tuple[SolverPoint, ...] = ()
+    rollouts: Count = 0
+    network_error: NonNegative | None = None
+    why_none: str = ""
+
+
 class Selected(StrictModel):
     """The results of the selection.
 
@@ -380,6 +422,7 @@ class Selected(StrictModel):
         search_points: Trials of the search; empty if too few models were timed.
         cost_model: The model that estimates their times; None if too few models were timed.
         analytic: Cost of the analytic field; None for a task without one.
+        solver: The solver beside the recommended model; None for a field.
         growth: Growth of the times with the number of particles.
         explained: Ids of the finalists whose filters and fields are in ``explanation/``.
         rolled: Ids of the finalists whose rollouts over test trajectories are in ``rollouts/``; empty for a field.
@@ -404,6 +447,7 @@ class Selected(StrictModel):
     search_points: tuple[SearchPoint, ...]
     cost_model: CostModel | None
     analytic: AnalyticCost | None
+    solver: SolverComparison | None = None
     growth: Growth
     explained: tuple[Id, ...]
     rolled: tuple[Id, ...] = ()

@@ -37,6 +37,7 @@ from cconv.study.records.summary import (
     Recommended,
     Selection,
     SizeTime,
+    SolverComparison,
     Stability,
     Summary,
     TaskFacts,
@@ -54,6 +55,7 @@ from cconv.study.stages.finalists import (
 )
 from cconv.study.stages.rolled import record_rollouts
 from cconv.study.stages.session import Session
+from cconv.study.stages.solver import compare_with_solver
 from cconv.tasks.samples import Sample, WindowSamples
 from cconv.tasks.task import FieldTask
 
@@ -100,7 +102,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
     points, cost_model = points_of_search(session.count_cost, run.trials(), judged.costs)
     return Summary(
         study=study.name,
-        task=_task(session),
+        task=_task(session, samples),
         dataset=_dataset(session, samples),
         baseline=BASELINE,
         checks=judged.checks,
@@ -115,6 +117,7 @@ def _summary(session: Session, stage: str, start: float) -> Summary:
         search_points=points,
         cost_model=cost_model,
         analytic=judged.analytic,
+        solver=_solver(session, finalists, judged, samples),
         growth=growth,
         explained=[each.id for each in explained],
         rolled=record_rollouts(session, finalists, judged.chosen.id),
@@ -290,6 +293,17 @@ def _of_seeds(finalist: Retrained, predictor: Callable[[Model], Any]) -> dict[st
     return {record.id: predictor(load_model(checkpoint)) for record, checkpoint in trained}
 
 
+def _solver(
+    session: Session, finalists: Sequence[Retrained], judged: _Judged, samples: Sequence[Sample]
+) -> SolverComparison | None:
+    """Measure the solver beside the chosen finalist of a step task."""
+    if not isinstance(samples, WindowSamples):
+        return None
+    name = judged.chosen.id
+    chosen = next(each for each in finalists if each.id == name)
+    return compare_with_solver(session, chosen, judged.costs[name].ms_per_frame, samples)
+
+
 def _explain(run: RunFolder, finalists: Sequence[Retrained], samples: Sequence[Sample]) -> None:
     """Save the filters, a predicted test frame and the error distribution of some finalists, for the report."""
     if not finalists:
@@ -344,8 +358,9 @@ def _front(errors: Mapping[str, np.ndarray], times: Mapping[str, Timing], worst:
     return Front(attainment=attainment(errors, milliseconds), hypervolume=area)
 
 
-def _task(session: Session) -> TaskFacts:
+def _task(session: Session, test_samples: Sequence[Sample]) -> TaskFacts:
     task, objective = session.problem.task, session.problem.objective
+    horizon = len(test_samples.windows[0].future) if isinstance(test_samples, WindowSamples) else None
     return TaskFacts(
         name=task.name,
         symbol=task.symbol,
@@ -354,6 +369,7 @@ def _task(session: Session) -> TaskFacts:
         error_meaning=objective.meaning,
         measures=objective.measures,
         mean_predictor=objective.mean_predictor,
+        horizon=horizon,
     )
 
 
