@@ -9,6 +9,7 @@ from torch import Tensor
 from cconv.data.trajectory import Boundary, Scene, Trajectory
 from cconv.data.window import Window, window_at
 from cconv.domain import Box
+from cconv.forces import Force
 
 SHAKEN = 0.05  # standard deviation of the shifts along each axis, particle spacings
 SQUEEZED, SQUEEZED_WITHIN = 0.1, 4.0  # share that lengths lose at the centre of a ball, its radius in spacings
@@ -36,10 +37,41 @@ class Mapping:
         """Map vectors (..., D), float64."""
         return vectors.double() @ self.matrix.T
 
+    def inverse(self, points: Tensor) -> Tensor:
+        """Map points (..., D) back, float64."""
+        return (points.double() - self.shift) @ torch.linalg.inv(self.matrix).T
+
     @property
     def factor(self) -> float:
         """By which lengths grow."""
         return float(self.matrix.abs().max())
+
+
+@dataclass(frozen=True)
+class MappedForce(Force):
+    """A force of a scene as it acts where the scene is mapped to.
+
+    Attributes:
+        force: The force before.
+        mapping: Maps the scene.
+    """
+
+    name = "mapped"
+    force: Force
+    mapping: Mapping
+
+    @property
+    def largest(self) -> float:
+        """Magnitude before, times the factor of lengths."""
+        return self.mapping.factor * self.force.largest
+
+    def check(self, dim: int) -> None:
+        """Check the force before the mapping; see `Force.check`."""
+        self.force.check(dim)
+
+    def __call__(self, positions: Tensor) -> Tensor:
+        """Accelerations (N, D) at positions (N, D)."""
+        return self.mapping.of_vectors(self.force(self.mapping.inverse(positions))).to(positions.dtype)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +168,7 @@ def _mapped(name: str, window: Window, scene: Scene, mapping: Mapping) -> Start:
         masses=window.masses * mapping.factor**scene.dim,
         boundary=None if window.boundary is None else _mapped_boundary(window.boundary, mapping),
     )
-    force = None if scene.force is None else tuple(mapping.of_vectors(torch.tensor(scene.force)).tolist())
+    force = None if scene.force is None else MappedForce(scene.force, mapping)
     spacing = mapping.factor * scene.particle_spacing
     return Start(
         name=name,

@@ -11,6 +11,7 @@ from cconv.domain import Box
 from cconv.evaluation.checks.mapped_starts import MappedStarts
 from cconv.evaluation.checks.rolled import make_rollout_material
 from cconv.evaluation.checks.starts import other_starts
+from cconv.forces import ConstantForce, ReversePoiseuilleForce
 from cconv.models.model import build_model
 from cconv.networks import ARCHITECTURES
 from cconv.tasks import task_named
@@ -23,7 +24,7 @@ TASK = task_named("acceleration", history=HISTORY)
 @pytest.fixture
 def scene():
     """A box of twice the height of its width, open above, under gravity."""
-    return replace(periodic_scene(12), box=Box([1, 0], [2, 2], (True, False)), force=(0.3, -1.0))
+    return replace(periodic_scene(12), box=Box([1, 0], [2, 2], (True, False)), force=ConstantForce((0.3, -1.0)))
 
 
 @pytest.fixture
@@ -115,9 +116,10 @@ def test_a_mapped_flow_has_the_same_distances_in_spacings(name, starts, trajecto
 def test_a_quarter_of_a_turn_swaps_the_axes_of_the_box_and_turns_the_force(starts, scene):
     turned = starts["turned"].scene
     assert turned.box == Box([1, 0], [3, 1], (False, True))
-    assert turned.force == pytest.approx((1.0, 0.3))
-    assert starts["mirrored"].scene.force == pytest.approx((-0.3, -1.0))
-    assert starts["scaled"].scene.force == pytest.approx((0.45, -1.5))
+    expected = {"turned": (1.0, 0.3), "mirrored": (-0.3, -1.0), "scaled": (0.45, -1.5)}
+    somewhere = torch.ones(1, 2, dtype=torch.float64)
+    for name, force in expected.items():
+        assert starts[name].scene.force(somewhere)[0].tolist() == pytest.approx(force)
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -145,3 +147,12 @@ def test_rollouts_of_equivariant_networks_turn_with_the_flow_and_all_scale_with_
     assert found["scaled"] < 1e-3
     for name in ("turned", "mirrored"):
         assert (found[name] < 1e-3) == network.is_equivariant
+
+
+def test_a_force_that_depends_on_the_position_is_mapped_with_the_place_it_acts_at(trajectory, scene):
+    force = ReversePoiseuilleForce(magnitude=0.5, height=1.0)
+    begun = {each.name: each for each in other_starts(trajectory, replace(scene, force=force), 3, 2)}
+    for name in ("turned", "mirrored", "scaled"):
+        mapping, mapped = begun[name].mapping, begun[name].scene.force
+        points = 0.7 + torch.rand(20, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        torch.testing.assert_close(mapped(mapping(points)), mapping.of_vectors(force(points)))
