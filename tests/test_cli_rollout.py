@@ -357,7 +357,7 @@ def test_a_test_split_too_short_for_rollouts_is_told_before_anything_is_trained(
     space = Path(__file__).parents[1] / "search_spaces" / "rollout.toml"
     (tmp_path / "study.toml").write_text(STUDY.format(layers=1).replace("none.toml", str(space)))
     outcome = cconv("study", "run", tmp_path / "study.toml", "--data", tmp_path / "data", "--out", tmp_path / "run")
-    assert_one_clear_line(outcome, "trajectory test/00000: has 7 frames, too few for a window of 3 and 5 after it")
+    assert_one_clear_line(outcome, "trajectory test/00000: has 7 frames, too few for a window of 6 and 5 after it")
     assert not (tmp_path / "run").exists()
 
 

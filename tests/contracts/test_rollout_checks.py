@@ -220,7 +220,7 @@ def test_a_rollout_that_comes_to_its_stored_length_alone_is_told_apart(task):
 def test_the_first_frame_beyond_a_limit_is_that_of_the_finding(task, fault):
     path, asked = vortices(), task_named(task, history=3)
     material = material_of(asked, path, torch.zeros(SIDE**2, dtype=torch.int64), SCENE)
-    model = Replay(asked, path, fault)
+    model = Replay(material, path, fault)
     (rolled,) = material.rolled(model)
     checks = [check for name in asked.checks if isinstance(check := CHECKS[name](material), SeriesCheck)]
     beyond = [check.first_beyond(rolled.positions, rolled.start) for check in checks]

@@ -10,6 +10,8 @@ from cconv.study.records.rollouts import read_rollouts
 from cconv.study.records.run_folder import RunFolder
 from cconv.tasks import TASKS
 
+LONGEST = 6  # history in the space, at whose presents all models begin
+
 pytestmark = pytest.mark.integration
 
 
@@ -43,7 +45,7 @@ def test_models_of_all_histories_are_compared_at_the_same_presents(run, cconv):
     for entry in run.summary().finalists:
         card = json.loads((run.path / entry.checkpoint / "card.json").read_text())
         config = json.loads((run.path / entry.checkpoint / "config.json").read_text())
-        assert (card["window"], config["history"]) == (6, card["parameters"].get("task.history"))
+        assert (card["window"], config["history"]) == (LONGEST, card["parameters"].get("task.history"))
         code, printed, _ = cconv("evaluate", run.path / entry.checkpoint, "--split", "valid", "--json")
         assert code == 0
         assert json.loads(printed)["rollout_mse"] == pytest.approx(card["valid_error"], rel=1e-3)
@@ -85,7 +87,7 @@ def test_every_training_of_a_finalist_is_rolled_out_over_the_whole_test_trajecto
         (found,) = read_rollouts(run, [entry.id]).values()
         assert {each.seed for each in found.rolled} == set(entry.test.by_seed)
         for each in found.rolled:
-            assert (each.trajectory, each.stored) == (stored.name, len(stored) - 3)
+            assert (each.trajectory, each.stored) == (stored.name, len(stored) - LONGEST)
             assert len(each.mse) == each.stored or each.ended.startswith("diverged")
             assert sum(each.reference.neighbors) == pytest.approx(1)
             step = entry.test.measures["first-frame MSE"]
@@ -95,7 +97,7 @@ def test_every_training_of_a_finalist_is_rolled_out_over_the_whole_test_trajecto
 def test_the_frames_of_the_first_rollout_of_the_recommended_model_are_kept_and_drawn(run):
     rolled = open_dataset(run.path / "rollouts" / "recommended")
     (found,) = read_rollouts(run, [run.summary().recommended.id]).values()
-    assert len(rolled.trajectory("test", 0)) in {3 + len(each.mse) for each in found.rolled}
+    assert len(rolled.trajectory("test", 0)) in {LONGEST + len(each.mse) for each in found.rolled}
     page = (run.path / "report.html").read_text()
     assert 'src="data:image/gif;base64,R0lGOD' in page
     assert '<h2 id="rollouts">' in page
