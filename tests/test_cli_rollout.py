@@ -112,6 +112,17 @@ def test_a_rollout_is_a_data_set_with_its_metrics(fitted, steps_folder, cconv, t
         assert file["00000/position"].shape == (10, 100, 2)
 
 
+def test_relaxation_spreads_the_particles_of_a_rollout_and_is_told(fitted, cconv):
+    plain, relaxed = (
+        json.loads(cconv("rollout", fitted, "--frames", 6, "--json", *options)[1])
+        for options in ((), ("--relax", "0.02,0.3,3"))
+    )
+    assert plain["relaxation"] is None
+    assert relaxed["relaxation"] == {"alpha": 0.02, "beta": 0.3, "loops": 3}
+    off_rest = [facts["metrics"]["rollout"]["rho_mae_unclamped"][-1] for facts in (plain, relaxed)]
+    assert off_rest[1] < off_rest[0]
+
+
 def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
     code, printed, _ = cconv("rollout", fitted, "--json")
     facts = json.loads(printed)
@@ -131,6 +142,8 @@ def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
         (["--frames", 0], "`--frames` must be at least 1, got 0"),
         (["--trajectory", 3], "has 1 trajectories, counted from 0; got 3"),
         (["--split", "tset"], "has no split 'tset'"),
+        (["--relax", "0.02,a"], "`--relax` must be three numbers ALPHA,BETA,LOOPS"),
+        (["--relax", "-1,0,3"], "alpha"),
         (["--vtk"], "`--vtk` writes to DIR/vtk and needs `--out DIR`"),
     ],
 )

@@ -1,6 +1,7 @@
 """`cconv rollout`: a saved model rolled out beside the stored frames."""
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,13 +11,14 @@ from cconv.cli.console import INTERRUPTED, errors, print_findings, print_json, r
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.model import other_scales, recommended_checkpoint, scale_facts
 from cconv.cli.study import DataPath
-from cconv.errors import CConvError, ConfigError
+from cconv.errors import CConvError, ConfigError, shown
 
 if TYPE_CHECKING:
     from cconv.data.dataset import Dataset
     from cconv.data.trajectory import Scene
     from cconv.evaluation.recorded_rollout import RecordedRollout
     from cconv.models.model import ModelConfig
+    from cconv.rollout.correctors import SPHRelaxation
 
 METRICS = "metrics.json"
 SOLVER_REPEATS = 3
@@ -48,6 +50,14 @@ def rollout(
             f"and valid.h5), {METRICS} and rollout.gif; rollout.mp4, too, if ffmpeg is there.",
         ),
     ] = None,
+    relax: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ALPHA,BETA,LOOPS",
+            help="Relax the particles by SPH after every frame, e.g. 0.02,0.3,3: LOOPS shifts of size ALPHA, with a "
+            "viscosity of BETA times the pressure (Neural SPH). Networks whose particles clump often hold on longer.",
+        ),
+    ] = None,
     vtk: Annotated[bool, typer.Option("--vtk", help="Also write VTK files for ParaView, to DIR/vtk.")] = False,
     mass: Mass = None,
     particle_spacing: Spacing = None,
@@ -73,12 +83,14 @@ def rollout(
         raise ConfigError("`--vtk` writes to DIR/vtk and needs `--out DIR`.")
     if frames is not None and frames < 1:
         raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
+    relaxation = None if relax is None else _relaxation(relax)
     checkpoint = recommended_checkpoint(checkpoint)
     model, card = load_model(checkpoint), read_card(checkpoint)
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     stored = StoredFrames(dataset, split, trajectory)
-    asked = asked_rollout(as_step(model.task), stored, dataset.scene, start, frames)
+    correctors = () if relaxation is None else (relaxation,)
+    asked = asked_rollout(as_step(model.task), stored, dataset.scene, start, frames, correctors)
     try:
         if out is None:
             recorded = record_rollout(model, asked, progress=show_progress)
@@ -92,6 +104,7 @@ def rollout(
         print_findings(trajectory_findings(dataset.trajectory(split, trajectory), dataset.scene))
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": len(asked.begun), **rollout_facts(recorded)}
+    facts["relaxation"] = None if relaxation is None else asdict(relaxation)
     facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:
         _write_beside(out, facts, stored.first_frame + start, vtk)
@@ -101,6 +114,20 @@ def rollout(
         _print(facts, out)
     if recorded.ended is not None:
         raise typer.Exit(INTERRUPTED if recorded.ended == "interrupted" else 1)
+
+
+def _relaxation(text: str) -> "SPHRelaxation":
+    """Read `--relax ALPHA,BETA,LOOPS`."""
+    from cconv.rollout.correctors import SPHRelaxation
+
+    parts = text.split(",")
+    try:
+        alpha, beta, loops = float(parts[0]), float(parts[1]), int(parts[2])
+    except (ValueError, IndexError):
+        parts = []
+    if len(parts) != 3:
+        raise ConfigError(f"`--relax` must be three numbers ALPHA,BETA,LOOPS, e.g. 0.02,0.3,3, got {shown(text)}.")
+    return SPHRelaxation(alpha, beta, loops)
 
 
 def _solver_facts(dataset: "Dataset", recorded: "RecordedRollout") -> dict:
@@ -168,7 +195,8 @@ def _print(facts: dict, out: Path | None) -> None:
     lines.append(f"  Chamfer distance                           {metrics['chamfer'][-1]:.4g}")
     lines.append(f"Sinkhorn divergence at frame {metrics['sinkhorn_frames'][-1]}: {metrics['sinkhorn'][-1]:.4g}")
     own, solver = facts["milliseconds_per_frame"], facts["solver"]
-    lines.append(f"{own:.4g} ms per frame")
+    relaxed = "" if facts["relaxation"] is None else ", the relaxation included"
+    lines.append(f"{own:.4g} ms per frame{relaxed}")
     if "not_timed" in solver:
         lines.append(f"The solver was not timed: {solver['not_timed']}")
     else:

@@ -3,7 +3,7 @@
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from cconv.data.trajectory import Scene, Trajectory
 from cconv.data.window import Window, check_window, window_at
 from cconv.evaluation.rollout_comparison import RolloutMeter, RolloutMetrics, check_masses, speed_edges
 from cconv.models.model import Model
+from cconv.rollout.correctors import Corrector
 from cconv.rollout.rollout import Diverged, rollout
 from cconv.tasks.task import StepTask
 
@@ -63,6 +64,7 @@ class Asked:
         scene: Scene of the frames.
         stride: Frames from one that all metrics look at to the next; squared errors are of every frame.
         most_sinkhorn: Largest number of frames with a Sinkhorn divergence.
+        correctors: What corrects each frame before the next is asked for, in order.
     """
 
     begun: Trajectory
@@ -71,6 +73,7 @@ class Asked:
     scene: Scene
     stride: int = STRIDE
     most_sinkhorn: int = MOST_SINKHORN
+    correctors: Sequence[Corrector] = ()
 
     @property
     def start(self) -> Window:
@@ -79,7 +82,12 @@ class Asked:
 
 
 def asked_rollout(
-    task: StepTask, stored: StoredFrames, scene: Scene, start: int = 0, frames: int | None = None
+    task: StepTask,
+    stored: StoredFrames,
+    scene: Scene,
+    start: int = 0,
+    frames: int | None = None,
+    correctors: Sequence[Corrector] = (),
 ) -> Asked:
     """A rollout from a frame of a stored trajectory on.
 
@@ -89,6 +97,7 @@ def asked_rollout(
         scene: Its scene.
         start: First frame of the window that the rollout begins with.
         frames: Number of frames to predict; None for all that are stored after the window.
+        correctors: What corrects each frame.
 
     Raises:
         DataError: If the trajectory does not have all these frames.
@@ -101,6 +110,7 @@ def asked_rollout(
         stored=lambda: (stored[place].positions for place in range(first, first + future)),
         frames=future,
         scene=scene,
+        correctors=correctors,
     )
 
 
@@ -126,7 +136,7 @@ def record_rollout(
         Diverged: If the first frame would not be a state of particles any more.
         KeyboardInterrupt: If Ctrl-C came before a frame was measured.
     """
-    meter, path = _meter(asked), rollout(model, asked.start, asked.scene)
+    meter, path = _meter(asked), rollout(model, asked.start, asked.scene, correctors=asked.correctors)
     times: list[float] = []
     ended = None
     try:
