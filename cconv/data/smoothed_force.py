@@ -22,12 +22,12 @@ from torch import Tensor
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
 
-Force = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length/time²
+Accelerating = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length/time²
 
 _FARTHEST = 5.0  # standard deviations; beyond them lies less than 1e-6 of the weight
 
 
-def evaluated(force: Force, positions: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
+def evaluated(force: Accelerating, positions: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
     """Accelerations (N, D) by a force at some positions, checked.
 
     Raises:
@@ -65,7 +65,7 @@ def travel_deviation(velocity_deviations: Sequence[float]) -> float:
     return math.sqrt(sum(value**2 for value in velocity_deviations) / len(velocity_deviations))
 
 
-def smoothed(force: Force, deviations: Sequence[float], nodes: int = 64) -> Force:
+def smoothed(force: Accelerating, deviations: Sequence[float], nodes: int = 64) -> Accelerating:
     r"""The mean of a force over normally distributed displacements around each position.
 
     The mean is a sum over equally spaced displacements up to five standard deviations, a midpoint rule. With 64 of them
@@ -111,7 +111,7 @@ def _rule(deviation: float, nodes: int) -> list[tuple[float, float]]:
     return list(zip((deviation * places).tolist(), (weights / weights.sum()).tolist(), strict=True))
 
 
-def smoothed_reverse_poiseuille(box: Box, magnitude: float, deviation: float) -> Force:
+def smoothed_reverse_poiseuille(box: Box, magnitude: float, deviation: float) -> Accelerating:
     r"""The smoothed force of reverse Poiseuille flow in closed form: along x, opposite in the lower and the upper half.
 
     .. math:: g_x = g \left[ \operatorname{erf}(s) + \operatorname{erf}(s - 2 a) - \operatorname{erf}(s - a) \right],

@@ -95,6 +95,7 @@ def _corrected(corrector: Corrector, before: Window, after: Window, scene: Scene
     return corrected
 
 
+@torch.no_grad()
 def check_state(window: Window, scene: Scene) -> None:
     """Check that the present frame can be asked about: finite, without leaps, with a bounded number of neighbours.
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from cconv.data.smoothed_force import Force, evaluated
+from cconv.data.smoothed_force import Accelerating, evaluated
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 from cconv.tasks.integrators import Integrator
@@ -26,7 +26,7 @@ class WithExternalForce:
     """
 
     integrator: Integrator
-    force: Force
+    force: Accelerating
 
     def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
         """The window a frame later; arguments as of `Integrator.advance`.

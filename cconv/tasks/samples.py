@@ -1,7 +1,7 @@
 """Samples: frames with what a network is given and what it has to answer."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -71,9 +71,16 @@ def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "
     return Sample(trajectory=trajectory, frame=index, inputs=inputs, target=target, target_unit=unit)
 
 
-def make_step_sample(window: Window, scene: Scene, task: StepTask) -> StepSample:
-    """Inputs with all features of a task, and the answer that leads to the first frame of the window's future."""
-    inputs = task.inputs(window, scene, task.features)
+def make_step_sample(window: Window, scene: Scene, task: StepTask, names: Collection[str] | None = None) -> StepSample:
+    """Inputs of a window, and the answer that leads to the first frame of its future.
+
+    Args:
+        window: The window.
+        scene: Its scene.
+        task: What is asked.
+        names: Features of the task that the inputs hold; None for all.
+    """
+    inputs = task.inputs(window, scene, task.features if names is None else names)
     unit = task.unit(inputs.units)
     return StepSample(
         trajectory=window.trajectory,

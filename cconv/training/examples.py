@@ -68,4 +68,4 @@ class AugmentedExamples:
         window = self.augmentation(self.samples.window(index), scene, generator)
         steps = min(self.pushforward.steps(update, generator), len(window.future) - 1)
         window = pushed(model, window, scene, steps)
-        return make_step_sample(window, scene, self.samples.task)
+        return make_step_sample(window, scene, self.samples.task, model.config.features)

@@ -1,7 +1,7 @@
 """Unrolling: a model learns from states that its own rollout leads to."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 from cconv.models.model import FrameGeometry, Model
-from cconv.rollout.rollout import Diverged, StepModel, check_state, rollout
+from cconv.rollout.rollout import Diverged, StepModel, advance, rollout
 from cconv.tasks.samples import Sample, StepSample, make_step_sample
 
 
@@ -77,10 +77,9 @@ def _followed(model: Model, sample: Sample, prediction: Tensor) -> StepSample | 
     if not isinstance(sample, StepSample) or len(sample.window.future) < 2:
         return None
     answer = model.in_units_of_data(prediction, sample.inputs)
-    window = replace(sample.window, positions=sample.window.positions.double())
-    window = sample.task.integrator.advance(window, answer, sample.scene)
+    path = advance(lambda window, scene: answer, sample.task.integrator, sample.window, sample.scene)
     try:
-        check_state(replace(window, positions=window.positions.detach()), sample.scene)
+        window = next(path)
     except Diverged:
         return None
-    return make_step_sample(window, sample.scene, sample.task)
+    return make_step_sample(window, sample.scene, sample.task, model.config.features)

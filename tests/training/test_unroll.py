@@ -64,6 +64,16 @@ def equivariant(samples, generator):
     return model_of(configured(architecture="radial_net", layers=2), SCENE, "acceleration", list(samples), generator)
 
 
+def test_examples_hold_what_the_model_takes_as_samples_with_all_features_have_it(samples, model):
+    """No sum over neighbours is taken for a feature that the model does without."""
+    model.config = model.config.model_copy(update={"features": ("one", "accelerations", "velocity")})
+    drawn = (
+        AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(0, 0), seed=0).draw(0, 1, model).inputs.features
+    )
+    assert set(drawn.names) == {"one", "accelerations", "velocity"}
+    assert torch.equal(drawn.flat(), samples[0].inputs.features.select(drawn.names).flat())
+
+
 def errors_of(model, sample, steps):
     """Root of the mean squared error of each step, in the units of the data."""
     pairs = unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))

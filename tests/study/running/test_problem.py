@@ -31,7 +31,8 @@ def test_a_closed_form_is_fitted_to_stored_windows_however_early_pushforward_beg
     """Before it is fitted, its own rollout leads nowhere."""
     window = window_of(periodic_frame(generator), generator, future=6)
     task = task_named("acceleration")
-    samples, unfitted = WindowSamples([window], periodic_scene(), task), SimpleNamespace(task=task, predict_frame=None)
+    samples, config = WindowSamples([window], periodic_scene(), task), SimpleNamespace(features=task.features)
+    unfitted = SimpleNamespace(task=task, predict_frame=None, config=config)
     training = TrainingConfig(pushforward=5, pushforward_from=0.0)
     drawn = [
         replace(problem(generator), train_samples=samples).examples(training, seed, task.history).draw(0, 0, unfitted)
