@@ -34,7 +34,6 @@ from cconv.networks.network import (
 )
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.nn.radial_conv import RadialConv, RadialGeometry
-from cconv.ops.convolution import columns
 from cconv.ops.radial import MOST_READS, num_reads
 from cconv.validation import Flag, Whole
 
@@ -188,8 +187,8 @@ class RadialTerms(LinearTerms[RadialGeometry]):
     ) -> list[Float[Tensor, "R P"]]:
         """Terms of the scalars (N, P) and of the components of the vectors (N · D, P'), where there are any."""
         boundary = with_inputs(self.network.boundary_conv, walls)
-        gathered = [_radial_columns(conv, seen.features, seen.geometry) for conv, seen in boundary]
-        gathered.append(_radial_columns(self.network.convs[0], features, geometry))
+        gathered = [conv.columns(seen.features, seen.geometry) for conv, seen in boundary]
+        gathered.append(self.network.convs[0].columns(features, geometry))
         scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
         of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
         if self.network.own_dense is not None and self.network.own_dense.bias is not None:
@@ -221,12 +220,6 @@ class RadialTerms(LinearTerms[RadialGeometry]):
     @property
     def _out_channels(self) -> Kinds:
         return self.network.convs[0].out_channels
-
-
-def _radial_columns(conv: RadialConv, features: Tensor, geometry: RadialGeometry) -> tuple[Tensor, Tensor]:
-    to_scalars, to_vectors = geometry.messages(features, conv.in_channels, conv.message)
-    components = [columns(component, geometry.reads) for component in to_vectors]
-    return columns(to_scalars, geometry.reads), torch.stack(components, dim=1).flatten(0, 1)
 
 
 class RadialNetSettings(ConvolutionSettings):

@@ -38,7 +38,7 @@ from cconv.nn.continuous_conv import (
 from cconv.nn.filters import WINDOWS, interpolate
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
 from cconv.ops import radial, radial_columns
-from cconv.ops.convolution import convolve
+from cconv.ops.convolution import columns, convolve
 from cconv.ops.filter_reads import FilterReads
 from cconv.ops.radial_columns import WeightedEdges
 
@@ -229,6 +229,25 @@ class RadialConv(nn.Module):
         if self.bias is None:
             return output
         return torch.cat([output[:, : len(self.bias)] + self.bias, output[:, len(self.bias) :]], dim=1)
+
+    def columns(
+        self, features: Float[Tensor, "M C_in"], geometry: RadialGeometry
+    ) -> tuple[Float[Tensor, "N P"], Float[Tensor, "R Q"]]:
+        """Gather the messages into radial terms, not differentiable.
+
+        The convolution without bias is these times the flattened filters of scalars (B · (S + V), S_out) and of vectors
+        (B · (S + 2V), V_out).
+
+        Returns:
+            Of each receiver (N, B · (S + V)), and of the components of its vectors (N · D, B · (S + 2V)).
+        """
+        own, num_terms = MESSAGES[self.message], geometry.num_terms
+        with torch.no_grad():
+            if radial_columns.applies(features, geometry.weighted_edges):
+                return radial_columns.columns(features, self.in_channels, geometry.weighted_edges, own, num_terms)
+            to_scalars, to_vectors = geometry.messages(features, self.in_channels, self.message)
+            components = [columns(component, geometry.reads) for component in to_vectors]
+            return columns(to_scalars, geometry.reads), torch.stack(components, dim=1).flatten(0, 1)
 
     def _convolve_generally(
         self, features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, geometry: RadialGeometry

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from cconv.neighbors import Edges
 from cconv.ops import gathers, radial_gathers
-from cconv.ops.blocks import Sums, for_blocks
+from cconv.ops.blocks import Sums, for_blocks, for_ranges
 from cconv.ops.products import linear
 from cconv.ops.workers import runs_compiled
 
@@ -84,6 +84,30 @@ def convolve(
         Scalars, then components of each vector, (N, S_out + V_out · D).
     """
     return _RadialConv.apply(features, scalar_filters, vector_filters, weighted, own, general)
+
+
+def columns(
+    features: Tensor, kinds: Kinds, weighted: WeightedEdges, own: tuple[float, float], num_terms: int
+) -> tuple[Tensor, Tensor]:
+    """Gather the messages into radial terms, (N, B · (S + V)) and (N · D, B · (S + 2V)), not differentiable.
+
+    Multiplied by filters of scalars, flattened to (B · (S + V), S_out), and of vectors, (B · (S + 2V), V_out), they are
+    the convolution.
+    """
+    (scalars, vectors), dim = kinds, weighted.edges.dim
+    gathered = _along(_split(features.detach(), kinds, dim), weighted, own, num_terms)
+    found = [features.new_empty(shape) for shape in gathered.shapes]
+
+    def visit(first: int, last: int) -> None:
+        gathered.gather(first, last, *(each[first:last].numpy() for each in found))
+
+    num_values = 2 * gathered.num_edges * sum(shape[1] * shape[3] for shape in gathered.shapes)
+    for_ranges(weighted.edges.num_receivers, num_values, visit)
+    projected, themselves = found[0].split([vectors, scalars], dim=3)
+    of_scalars = torch.cat([themselves, projected], dim=3)
+    projected, directed, themselves = found[1].split([vectors, scalars, vectors], dim=3)
+    of_vectors = torch.cat([directed, themselves, projected], dim=3)
+    return of_scalars.flatten(0, 1).flatten(1), of_vectors.flatten(0, 1).flatten(1)
 
 
 class _RadialConv(torch.autograd.Function):

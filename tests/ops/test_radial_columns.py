@@ -7,7 +7,7 @@ import torch
 
 from cconv.neighbors import radius_graph
 from cconv.nn import RadialConv, RadialGeometry
-from cconv.nn.kinds import Kinds
+from cconv.nn.kinds import Kinds, join_kinds
 from cconv.nn.radial_conv import MESSAGES
 from cconv.ops import blocks, radial_columns, radial_gathers
 
@@ -219,3 +219,15 @@ def test_wide_layers_predict_what_they_are_trained_on(message, dtype, generator)
         predicted = layer(features, geometry)
     assert not {"reads", "directions"} & vars(geometry).keys()
     assert torch.equal(predicted, layer(features, geometry))
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+@pytest.mark.parametrize("terms", [1, 7])
+def test_columns_times_filters_are_the_convolution(message, terms, generator):
+    layer = layer_of(generator, CHANNELS[2], 2, terms=terms, message=message)
+    geometry = geometry_of(generator, 2, terms=terms, window="poly6", points=300)
+    (features, *filters), _ = inputs_of(generator, layer, geometry)
+    columns = layer.columns(features, geometry)
+    scalars, vectors = (each @ filter.flatten(0, 1) for each, filter in zip(columns, filters, strict=True))
+    product = join_kinds(scalars, vectors.unflatten(0, (-1, 2)).transpose(1, 2))
+    torch.testing.assert_close(product, layer(features, geometry), **TIGHT)
