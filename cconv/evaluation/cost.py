@@ -19,7 +19,7 @@ from cconv.domain import Box
 from cconv.evaluation.memory import peak_megabytes
 from cconv.models.model import Model, ModelConfig
 from cconv.neighbors import radius_graph
-from cconv.networks.counting import NeighborDensity
+from cconv.networks.counting import CountedCost, NeighborDensity
 from cconv.ops.workers import torch_threads
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
@@ -264,9 +264,14 @@ def _block_scene(field: ModelConfig, side: int) -> Scene:
 
 def flops_per_particle(model: Model, inputs: Inputs) -> float:
     """Count the multiplications and additions of a prediction per particle, from settings and a frame."""
-    config = model.config
+    return counted_cost(model.config, inputs).flops_per_particle
+
+
+def counted_cost(config: ModelConfig, inputs: Inputs) -> CountedCost:
+    """Count the cost of a prediction per particle, that of the predictor included, from settings and a frame."""
     around = neighbor_density(inputs, config.network.relative_cutoff)
-    return config.network.count(config.inputs, config.walls, config.output, config.dim, around).flops_per_particle
+    counted = config.network.count(config.inputs, config.walls, config.output, config.dim, around)
+    return counted if config.predictor is None else counted + counted_cost(config.predictor, inputs)
 
 
 def neighbor_density(inputs: Inputs, relative_cutoff: float) -> NeighborDensity:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from cconv.errors import ConfigError, shown
 from cconv.files import read_json
-from cconv.models.model import Model, ModelConfig, without_weights
-from cconv.models.standardization import unknown
+from cconv.models.model import Model, ModelConfig, untrained, without_weights
 from cconv.validation import Horizon, OpenModel, Real, Seed, validated
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "card.json"
@@ -82,7 +81,7 @@ def load_model(path: Path | str, task: str | None = None) -> Model:
             f"{folder}: the model is for task {config.task!r}, not {shown(task)}; give a checkpoint of that task."
         )
     tensors = _read_weights(folder, config)
-    model = Model(config, unknown(config.inputs, config.dim), unknown(config.output, config.dim))
+    model = untrained(config)
     model.load_state_dict(tensors)
     return model.eval()
 

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -23,7 +23,7 @@ from cconv.sph.kernels import KERNELS, AbstractKernel
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.features import CONSTANT, WALLS, Inputs
 from cconv.tasks.samples import Sample
-from cconv.tasks.task import Task
+from cconv.tasks.task import StepTask, Task, as_step
 from cconv.validation import Length, StrictModel, Whole
 
 MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
@@ -36,6 +36,7 @@ class ModelConfig(StrictModel):
     `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` and `frame_dt` are those of
     the training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
     features of the task that are inputs of the model.
+    `predictor` is the model whose step the network corrects, if there is one.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     """
 
@@ -50,6 +51,7 @@ class ModelConfig(StrictModel):
     wall_scalars: Whole = Field(ge=0, le=1)
     wall_vectors: Whole = Field(ge=0, le=1)
     network: NetworkTable
+    predictor: "ModelConfig | None" = None
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -62,6 +64,17 @@ class ModelConfig(StrictModel):
             raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
+        return self
+
+    @model_validator(mode="after")
+    def _predictor_fits(self) -> "ModelConfig":
+        if self.predictor is None:
+            return self
+        if self.predictor.predictor is not None:
+            raise ValueError("a predictor must not have a predictor itself")
+        if self.predictor.dim != self.dim:
+            raise ValueError(f"the predictor is for {self.predictor.dim} dimensions, the network for {self.dim}")
+        as_step(self.asked).check_predictor(self.predictor.asked)
         return self
 
     @property
@@ -113,7 +126,7 @@ class Model(nn.Module):
     """A model that predicts the target of a task at the fluid particles of a frame.
 
     Args:
-        config: Configuration of the model.
+        config: Configuration of the model; if it has a predictor, that of the model has no weights yet.
         features: Standardisation of the fluid features that the model takes, from the training split.
         targets: Standardisation of the target, from the training split.
         generator: Source of the initial weights; None for torch's global one.
@@ -133,7 +146,8 @@ class Model(nn.Module):
     ):
         super().__init__()
         self.config = config
-        self.task = config.asked
+        self.predictor = None if config.predictor is None else untrained(config.predictor).requires_grad_(False)
+        self.task = config.asked if self.predictor is None else as_step(config.asked).correcting(self.predictor)
         self.settings: NetworkSettings = config.network
         self.network: Network[Any] = config.network.build(
             config.inputs, config.walls, config.output, config.dim, generator
@@ -201,9 +215,11 @@ class Model(nn.Module):
         return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
 
     def in_units_of_data(self, prediction: Float[Tensor, "M C"], inputs: Inputs) -> Float[Tensor, "M C"]:
-        """Convert a standardised prediction (M, C) to the units of the data that the inputs were made of."""
-        return (prediction * self.target_scale + self.target_mean) * self.task.unit(inputs.units)
+        """Convert a standardised prediction (M, C) to the units of the data, and add what a predictor has answered."""
+        answer = (prediction * self.target_scale + self.target_mean) * self.task.unit(inputs.units)
+        return answer if inputs.known is None else answer + inputs.known
 
+    @torch.no_grad()
     def predict_frame(self, frame: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
         """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data.
 
@@ -211,7 +227,12 @@ class Model(nn.Module):
             frame: A frame for a model of a field, a window up to the present frame for a model of a step.
             scene: Its scene.
         """
-        return self.predict(self.inputs(frame, scene))
+        return self.answer(frame, scene)
+
+    def answer(self, observed: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
+        """`predict_frame`, differentiable."""
+        inputs = self.inputs(observed, scene)
+        return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
 
     def inputs(self, frame: Frame | Window, scene: Scene) -> Inputs:
         """Compute the inputs of a frame or window, only the features that the model takes."""
@@ -247,7 +268,7 @@ def build_model(
 
     Args:
         network: Settings of the network.
-        task: Task of the model.
+        task: Task of the model; a predictor of the task becomes part of the model, with its weights.
         features: Names of the features of the task that are inputs; the constant is always one of them.
         scene: Scene of the samples.
         train_samples: Training split.
@@ -260,6 +281,7 @@ def build_model(
     walls = (given.wall_kinds if WALLS in features else None) or Kinds(0, 0)
     names = {CONSTANT, *features}
     task.check_features(names)
+    predictor = cast("Model | None", task.predictor) if isinstance(task, StepTask) else None
     config = ModelConfig(
         task=task.name,
         kernel=task.kernel,
@@ -272,6 +294,7 @@ def build_model(
         wall_scalars=walls.scalars,
         wall_vectors=walls.vectors,
         network=network,
+        predictor=None if predictor is None else predictor.config,
     )
     # Shifted vectors would break the rotation equivariance of the network.
     turns = network.is_equivariant
@@ -280,7 +303,10 @@ def build_model(
     targets = standardize_values((sample.target for sample in train_samples), center)
     standardization = standardize_features(taken, center_vectors=not turns)
     without_weights(config)
-    return Model(config, standardization, targets, generator)
+    model = Model(config, standardization, targets, generator)
+    if predictor is not None and model.predictor is not None:
+        model.predictor.load_state_dict(predictor.state_dict())
+    return model
 
 
 def absent_features(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:
@@ -301,6 +327,11 @@ def absent_features(task: Task, names: Collection[str], samples: Sequence[Sample
     return unseen
 
 
+def untrained(config: ModelConfig) -> Model:
+    """A model that knows no data yet."""
+    return Model(config, unknown(config.inputs, config.dim), unknown(config.output, config.dim))
+
+
 def without_weights(config: ModelConfig) -> Model:
     """Build a model without weights, which takes no memory, to see its size.
 
@@ -308,7 +339,7 @@ def without_weights(config: ModelConfig) -> Model:
         ConfigError: If it would have more than `MOST_PARAMETERS` learned values.
     """
     with torch.device("meta"):
-        hollow = Model(config, unknown(config.inputs, config.dim), unknown(config.output, config.dim))
+        hollow = untrained(config)
     if hollow.num_parameters > MOST_PARAMETERS:
         raise ConfigError(
             f"the network would have {hollow.num_parameters:,} learned values, more than {MOST_PARAMETERS:,}; lower "

@@ -159,6 +159,8 @@ class Inputs:
         box: Bounds and periodic axes, particle spacings.
         units: What these numbers are multiples of.
         answered: Which particles the network has to answer for, (N,), bool: the fluid; None for all.
+        known: What a predictor has answered for them already, (M, D), in the units of the data: the network has to
+            answer what remains. None without a predictor.
     """
 
     positions: Float[Tensor, "N D"]
@@ -168,6 +170,7 @@ class Inputs:
     box: Box
     units: Units
     answered: Bool[Tensor, " N"] | None = None
+    known: Float[Tensor, "M D"] | None = None
 
     @property
     def num_particles(self) -> int:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -72,7 +72,7 @@ def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "
 
 
 def make_step_sample(window: Window, scene: Scene, task: StepTask, names: Collection[str] | None = None) -> StepSample:
-    """Inputs of a window, and the answer that leads to the first frame of its future.
+    """Inputs of a window, and the answer that leads to the first frame of its future, or what remains of it.
 
     Args:
         window: The window.
@@ -81,12 +81,12 @@ def make_step_sample(window: Window, scene: Scene, task: StepTask, names: Collec
         names: Features of the task that the inputs hold; None for all.
     """
     inputs = task.inputs(window, scene, task.features if names is None else names)
-    unit = task.unit(inputs.units)
+    unit, target = task.unit(inputs.units), task.target(window, scene)
     return StepSample(
         trajectory=window.trajectory,
         frame=window.frame,
         inputs=inputs,
-        target=(task.target(window, scene) / unit).float(),
+        target=((target if inputs.known is None else target - inputs.known) / unit).float(),
         target_unit=unit,
         window=window,
         scene=scene,
@@ -118,9 +118,9 @@ class WindowSamples(Sequence[StepSample]):
         """The window of a sample, no longer than the history of the task."""
         return self.windows[index].ending(self.task.history)
 
-    def of_history(self, history: int) -> "WindowSamples":
-        """Samples of the same presents whose answers depend on fewer frames."""
-        return WindowSamples(self.windows, self.scene, replace(self.task, history=history))
+    def of_task(self, task: StepTask) -> "WindowSamples":
+        """Samples of the same presents of another task, whose answers depend on as many frames or fewer."""
+        return WindowSamples(self.windows, self.scene, task)
 
     @cached_property
     def spread(self) -> list[StepSample]:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -138,12 +138,27 @@ class FieldTask(Task):
         return make_inputs(self.state(observed, scene), observed.boundary, scene, names)
 
 
+@runtime_checkable
+class Predictor(Protocol):
+    """A model of a step that answers before another one does."""
+
+    task: Any
+
+    def answer(self, observed: Window, scene: Scene) -> Tensor:
+        """Answer (M, D) for each of the M fluid particles at the end of a window, differentiable."""
+
+
 @dataclass(frozen=True)
 class StepTask(Task):
     """The step to the next stored frame, from a window of frames up to the present one.
 
+    With a predictor, a network corrects its step: it is given the window that the predictor's answer leads to, and has
+    to answer what remains. So it sees where particles are about to come too close, which decides how they push each
+    other during a frame that is many solver steps long.
+
     Attributes:
         integrator: Turns answers into the next frame, and the next frame into the answer that leads to it.
+        predictor: Model of a step that answers first; None without one.
     """
 
     integrator: ClassVar[Integrator]
@@ -151,21 +166,48 @@ class StepTask(Task):
     histories = (2, 20)
 
     history: int = 6
+    predictor: Predictor | None = None
+
+    def correcting(self, predictor: Predictor) -> "StepTask":
+        """The task of correcting the step of a predictor.
+
+        Raises:
+            ConfigError: If the predictor is for another task or depends on more frames.
+        """
+        self.check_predictor(predictor.task)
+        return replace(self, predictor=predictor)
+
+    def check_predictor(self, asked: Task) -> None:
+        """Check that a model of some task can answer before one of this task does.
+
+        Raises:
+            ConfigError: If it is another task, or depends on more frames.
+        """
+        if asked.name != self.name:
+            raise ConfigError(f"the predictor must be a model of the task {self.name!r}, and is one of {asked.name!r}")
+        if asked.history > self.history:
+            raise ConfigError(
+                f"`history` must be at least {asked.history}, the predictor's, got {self.history}; raise it, or fit "
+                "the predictor with a shorter one"
+            )
 
     def target(self, window: Window, scene: Scene) -> Float[Tensor, "M C"]:
         """Answer (M, C) that leads the fluid to the first frame of the window's future, in the units of the data."""
         return self.integrator.target(window, scene)
 
     def inputs(self, observed: Window, scene: Scene, names: Collection[str]) -> Inputs:
-        """What a network that takes some features is given of a window.
+        """What a network that takes some features is given of a window, or of the one that the predictor leads to.
 
         Wall particles are particles like others, which send and receive, but no answer is asked for them. Boundary
         points count only where there are none.
         """
+        known = None if self.predictor is None else self.predictor.answer(observed, scene)
+        if known is not None:
+            observed = self.integrator.advance(observed, known, scene)
         kernel = self.kernel_at(scene.particle_spacing, scene.dim)
         boundary = observed.boundary if bool(observed.is_fluid.all()) else None
         state = window_state(observed, self.history, boundary, scene, kernel)
-        return replace(make_inputs(state, boundary, scene, names), answered=observed.is_fluid)
+        return replace(make_inputs(state, boundary, scene, names), answered=observed.is_fluid, known=known)
 
 
 def as_field(task: Task) -> FieldTask:

@@ -13,20 +13,21 @@ from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
 from cconv.tasks.task import StepTask
-from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
+from cconv.validation import Horizon, Length, OneOf, PathText, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 MOST_UNROLLED = 10  # steps that an update differentiates through, whose states are all kept in memory
 MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns from
 STILL = {"noise": 0.0, "pushforward": 0, "unroll": 1}  # settings of a training, with which no particle is moved
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
-HISTORY = "task.history"
+HISTORY, WITH_PREDICTOR = "task.history", "task.with_predictor"
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
 _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
 HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
     HISTORY,
+    WITH_PREDICTOR,
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
     *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
@@ -41,7 +42,8 @@ class TaskConfig(StrictModel):
 
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
     takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
-    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
+    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench; and
+    `predictor`, the checkpoint of a model that steps first, so that networks correct its step.
     """
 
     name: Annotated[str, OneOf(tuple(TASKS))]
@@ -50,6 +52,7 @@ class TaskConfig(StrictModel):
     features: tuple[str, ...] | None = Field(None, max_length=100)
     history: Whole | None = None
     horizon: Horizon | None = None
+    predictor: PathText | None = None
 
     @field_validator("kernel")
     @classmethod
@@ -77,6 +80,8 @@ class TaskConfig(StrictModel):
             TASKS[self.name].check_history(self.history)
         if self.horizon is not None and not issubclass(TASKS[self.name], StepTask):
             raise ValueError(f"`horizon` is for steps, and {self.name!r} is a field of one frame; remove it")
+        if self.predictor is not None and not issubclass(TASKS[self.name], StepTask):
+            raise ValueError(f"`predictor` is for steps, and {self.name!r} is a field of one frame; remove it")
         return self
 
     @property
@@ -130,12 +135,14 @@ class Configuration(NamedTuple):
         history: Frames that an answer depends on, the present one among them.
         network: Network settings.
         training: Training settings.
+        with_predictor: Whether the network corrects the step of the study's predictor, if there is one.
     """
 
     features: tuple[str, ...]
     history: int
     network: NetworkSettings
     training: TrainingConfig
+    with_predictor: bool = True
 
 
 DEFAULTS = Configuration(TASKS["density_rate"].features, 1, ConvNetSettings(), TrainingConfig())
@@ -174,6 +181,7 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
         _history(parameters, defaults),
         _possible(settings, NETWORK, kept | drawn),
         _possible(TrainingConfig, TRAINING, defaults.training.model_dump() | below(TRAINING, parameters)),
+        _with_predictor(parameters, defaults),
     )
 
 
@@ -231,6 +239,14 @@ def _history(parameters: Mapping[str, Value], defaults: Configuration) -> int:
     if not isinstance(history, int) or isinstance(history, bool):
         raise ConfigError(f"not possible ({HISTORY}: must be a whole number, got {shown(history)})")
     return history
+
+
+def _with_predictor(parameters: Mapping[str, Value], defaults: Configuration) -> bool:
+    """Whether the predictor steps first, as drawn or as in the study."""
+    with_predictor = parameters.get(WITH_PREDICTOR, defaults.with_predictor)
+    if not isinstance(with_predictor, bool):
+        raise ConfigError(f"not possible ({WITH_PREDICTOR}: must be true or false, got {shown(with_predictor)})")
+    return with_predictor
 
 
 def _check_features(parameters: Mapping[str, Value]) -> None:

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
-from cconv.evaluation.cost import Cost, neighbor_density
+from cconv.evaluation.cost import Cost, counted_cost, neighbor_density
 from cconv.evaluation.time_model import check_cost_model
 from cconv.networks.counting import CountedCost, NeighborDensity
 from cconv.study.declared.configuration import configure
@@ -38,13 +38,19 @@ class CostCounter:
         """
         configuration = configure(parameters, self._study.configuration)
         features, network = self._problem.features_of(configuration), configuration.network
-        return network.count(
+        counted = network.count(
             self._problem.task_of(configuration).kinds(features),
             self._inputs.wall_kinds if WALLS in features else None,
             self._problem.task.output,
             self._problem.scene.dim,
             self._around(network.relative_cutoff),
         )
+        return counted + self._of_predictor if configuration.with_predictor else counted
+
+    @cached_property
+    def _of_predictor(self) -> CountedCost:
+        predictor = self._problem.predictor
+        return CountedCost() if predictor is None else counted_cost(predictor.config, self._inputs)
 
     def _count(self, relative_cutoff: float) -> NeighborDensity:
         return neighbor_density(self._inputs, relative_cutoff)

@@ -13,6 +13,7 @@ from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
+from cconv.models.checkpoint import load_model
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
 from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TrainingConfig
@@ -20,7 +21,7 @@ from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
 from cconv.tasks.features import features_in
 from cconv.tasks.samples import HORIZON, Sample, WindowSamples, iterate_samples, learned_samples, rolled_samples
-from cconv.tasks.task import StepTask, Task, as_field
+from cconv.tasks.task import StepTask, Task, as_field, as_step
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
 from cconv.training.losses import LOSSES
@@ -41,12 +42,14 @@ class Problem:
         task: Task of the models, with the longest history of any of them.
         train_samples: Frames of the training split; features and targets are standardised by them.
         valid_samples: Frames of the validation split, by whose error the search compares models.
+        predictor: Model of a step that networks correct; None without one.
     """
 
     scene: Scene
     task: Task
     train_samples: Sequence[Sample]
     valid_samples: Sequence[Sample]
+    predictor: Model | None = None
 
     @property
     def objective(self) -> Objective:
@@ -56,39 +59,42 @@ class Problem:
     @property
     def typical_samples(self) -> Sequence[Sample]:
         """Training samples whose means and variances are those of all: all of them, or windows spread over them."""
-        return self._typical(self.task.history)
+        return self._typical(self.task)
 
     def task_of(self, configuration: Configuration) -> Task:
-        """Task of the models of a configuration, with its history."""
-        return replace(self.task, history=configuration.history)
+        """Task of the models of a configuration, with its history, after the predictor or without it."""
+        task = replace(self.task, history=configuration.history)
+        if self.predictor is None or not configuration.with_predictor:
+            return task
+        return as_step(task).correcting(self.predictor)
 
-    def _typical(self, history: int) -> Sequence[Sample]:
-        samples = self._training_samples(history)
+    def _typical(self, task: Task) -> Sequence[Sample]:
+        samples = self._training_samples(task)
         return samples.spread if isinstance(samples, WindowSamples) else samples
 
-    def _training_samples(self, history: int) -> Sequence[Sample]:
-        """Training samples of models with some history; those of each are made once."""
+    def _training_samples(self, task: Task) -> Sequence[Sample]:
+        """Training samples of models of a task with some history; those of each are made once."""
         if not isinstance(self.train_samples, WindowSamples):
             return self.train_samples
-        if history not in self._of_history:
-            self._of_history[history] = self.train_samples.of_history(history)
-        return self._of_history[history]
+        if task not in self._of_task:
+            self._of_task[task] = self.train_samples.of_task(as_step(task))
+        return self._of_task[task]
 
     @cached_property
-    def _of_history(self) -> dict[int, WindowSamples]:
+    def _of_task(self) -> dict[Task, WindowSamples]:
         return {}
 
     def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
         """Compute the error of a model on the validation split; without a cache all geometries are computed anew."""
         return self.objective.error(model, self.valid_samples, geometry)
 
-    def examples(self, training: TrainingConfig, seed: int, history: int) -> Examples:
-        """Make the examples of a training, with its noise and pushforward, of a model with some history.
+    def examples(self, training: TrainingConfig, seed: int, task: Task) -> Examples:
+        """Make the examples of a training, with its noise and pushforward, of a model of a task of `task_of`.
 
         Raises:
             ConfigError: If one of them is asked for where there are no windows.
         """
-        samples = self._training_samples(history)
+        samples = self._training_samples(task)
         if not training.moving:
             return StoredExamples(samples)
         if not isinstance(samples, WindowSamples):
@@ -105,7 +111,7 @@ class Problem:
 
         With noise, each place gives one noisy example; the loss says how much each frame counts.
         """
-        examples = self.examples(training, seed, model.task.history)
+        examples = self.examples(training, seed, model.task)
         drawn = (examples.draw(place, 0, model) for place in places)
         solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
 
@@ -122,12 +128,13 @@ class Problem:
 
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """Build an untrained model with the initial weights of `init_seed`."""
+        task = self.task_of(configuration)
         return build_model(
             configuration.network,
-            self.task_of(configuration),
+            task,
             self.features_of(configuration),
             self.scene,
-            self._typical(configuration.history),
+            self._typical(task),
             torch.Generator().manual_seed(init_seed),
         )
 
@@ -222,8 +229,9 @@ def load_problem(
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
     """
+    predictor = None if study.task.predictor is None else load_model(study.task.predictor, study.task.name)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
-    return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
+    return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid, predictor=predictor)
 
 
 def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:

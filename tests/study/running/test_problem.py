@@ -35,7 +35,7 @@ def test_a_closed_form_is_fitted_to_stored_windows_however_early_pushforward_beg
     unfitted = SimpleNamespace(task=task, predict_frame=None, config=config)
     training = TrainingConfig(pushforward=5, pushforward_from=0.0)
     drawn = [
-        replace(problem(generator), train_samples=samples).examples(training, seed, task.history).draw(0, 0, unfitted)
+        replace(problem(generator), train_samples=samples).examples(training, seed, task).draw(0, 0, unfitted)
         for seed in range(20)
     ]
     assert {sample.frame for sample in drawn} == {window.frame}
@@ -68,7 +68,7 @@ def test_a_model_does_not_depend_on_the_longest_history_that_others_have(history
     assert all(torch.equal(value, known[name]) for name, value in models[0].state_dict().items())
     for training in (TrainingConfig(), TrainingConfig(noise=0.02)):
         drawn = [
-            each.examples(training, 1, history).draw(2, 5, model)
+            each.examples(training, 1, each.task_of(of_history(history))).draw(2, 5, model)
             for each, model in zip((long, short), models, strict=True)
         ]
         assert drawn[0].frame == drawn[1].frame
