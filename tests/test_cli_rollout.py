@@ -9,9 +9,11 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+import torch
 from conftest import run_main
 from outcomes import assert_one_clear_line
 from particle_files import record_frames, write_parts
+from safetensors.torch import load_file
 
 from cconv.data.dataset import open_dataset
 from cconv.forces import ConstantForce
@@ -358,6 +360,29 @@ def test_a_network_of_several_layers_is_trained_on_noisy_windows(steps_folder, c
     assert "(rollout MSE)" in printed
     lines = (tmp_path / "run" / "log.jsonl").read_text().splitlines()
     assert [json.loads(line)["updates"] for line in lines] == [3, 6]
+
+
+def test_a_network_that_corrects_a_fitted_layer_is_trained_and_rolled_out(fitted, steps_folder, cconv, tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=2))
+    moved = ["training.pushforward=1", "training.pushforward_from=0", "training.unroll=2", "training.unroll_from=0"]
+    given = [f"task.predictor={fitted}", *moved]
+    settings = [argument for setting in given for argument in ("--set", setting)]
+    code, _, _ = cconv("train", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "run", *settings)
+    assert code == 0
+    checkpoint = tmp_path / "run" / "checkpoint"
+    assert json.loads((checkpoint / "config.json").read_text())["predictor"]["network"]["layers"] == 1
+    found, first = (load_file(folder / "model.safetensors") for folder in (checkpoint, fitted))
+    assert all(torch.equal(found[f"predictor.{name}"], values) for name, values in first.items())
+    assert len(found) > len(first)
+    assert cconv("rollout", checkpoint, "--frames", 1, "--out", tmp_path / "rolled")[0] == 0
+
+
+def test_a_predictor_that_is_not_there_is_told(steps_folder, cconv, tmp_path):
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=2))
+    given = ["--set", f"task.predictor={tmp_path / 'none'}"]
+    outcome = cconv("train", tmp_path / "study.toml", "--data", steps_folder, "--out", tmp_path / "run", *given)
+    assert_one_clear_line(outcome, "none: no model.safetensors; give a checkpoint folder")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_test_split_too_short_for_rollouts_is_told_before_anything_is_trained(steps_folder, cconv, tmp_path):

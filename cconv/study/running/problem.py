@@ -229,7 +229,8 @@ def load_problem(
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
     """
-    predictor = None if study.task.predictor is None else load_model(study.task.predictor, study.task.name)
+    path = study.task.predictor
+    predictor = None if path is None else load_model(path, study.task.name).requires_grad_(False)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
     return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid, predictor=predictor)
 
