@@ -294,6 +294,7 @@ def report(path: RunPath) -> None:
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
     """Return settings, samples and data of a study whose single model is written to `out`, which must not exist yet."""
     from cconv.data.plausibility import dataset_findings
+    from cconv.study.running.predictor import with_predictor
     from cconv.study.running.problem import load_problem, open_study_data, study_task, with_data_path
     from cconv.study.studies import load_study
 
@@ -304,4 +305,5 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
         raise ConfigError(f"{out}: exists already; give another --out.")
     dataset = open_study_data(config.data, config.seeds.data)
     print_findings(dataset_findings(dataset, show_progress))
-    return config, load_problem(config, dataset, study_task(config, dataset.scene), show_progress), dataset
+    problem = load_problem(config, dataset, study_task(config, dataset.scene), show_progress)
+    return config, with_predictor(problem, config, progress=show_progress), dataset

@@ -23,6 +23,7 @@ from cconv.study.running.counted_costs import CostCounter
 from cconv.study.running.observer import Observer
 from cconv.study.running.optuna_mirror import OptunaMirror, database_answers, open_mirror
 from cconv.study.running.pool import Pool
+from cconv.study.running.predictor import with_predictor
 from cconv.study.running.private_folder import remove_left_behind
 from cconv.study.running.problem import (
     Problem,
@@ -39,7 +40,7 @@ from cconv.study.studies import recorded_space, recorded_study
 from cconv.tasks.features import WALLS
 from cconv.validation import check_setting
 
-RAY_FILES = "ray"  # folder in that of the run
+RAY_FILES, PREDICTOR = "ray", "predictor"  # folders in that of the run
 
 
 def begin_study(study: StudyConfig, space: SearchSpace, run: RunFolder) -> None:
@@ -153,7 +154,7 @@ def _session(
     dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
     task = study_task(study, dataset.scene, longest_history(space, study))
     check_test_split(study, dataset, task)
-    problem = load_problem(study, dataset, task, progress)
+    problem = with_predictor(load_problem(study, dataset, task, progress), study, run.path / PREDICTOR, progress)
     for name in problem.task.optional:
         if name not in problem.present_features or (name == WALLS and not dataset.scene.has_boundary):
             space = fixed(space, feature_path(name))  # nothing to search, e.g. where there are no walls

@@ -63,7 +63,7 @@ def recorded_space(run: RunFolder) -> SearchSpace:
 
 
 def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
-    """Study from a TOML file; its search space and predictor are looked for beside the file, then in the working folder.
+    """Study from a TOML file; its search space is looked for beside the file, then in the working folder.
 
     Args:
         path: The study file.
@@ -82,10 +82,6 @@ def load_study(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     space = path.parent / study.search.space
     if space.is_file():
         study = study.model_copy(update={"search": study.search.model_copy(update={"space": str(space)})})
-    if study.task.predictor is not None:
-        predictor = path.parent / study.task.predictor
-        found = predictor if predictor.is_dir() else Path(study.task.predictor)
-        study = study.model_copy(update={"task": study.task.model_copy(update={"predictor": str(found.resolve())})})
     return study
 
 

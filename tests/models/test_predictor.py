@@ -16,7 +16,6 @@ from cconv.models.model import ModelConfig, build_model
 from cconv.rollout.rollout import advance, rollout
 from cconv.study.declared.configuration import DEFAULTS
 from cconv.study.running.problem import Problem
-from cconv.study.studies import load_study
 from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples, make_step_sample
 
@@ -133,8 +132,8 @@ def test_a_predictor_must_be_for_the_same_task_and_not_look_back_farther(predict
 def test_a_problem_has_models_with_and_without_it(predictor, window):
     samples = WindowSamples([window], SCENE, TASK)
     given = Problem(scene=SCENE, task=TASK, train_samples=samples, valid_samples=samples, predictor=predictor)
-    with_it = given.build_model(LAYER, 0)
-    without = given.build_model(configured(LAYER, with_predictor=False), 0)
+    with_it = given.build_model(configured(LAYER, with_predictor=True), 0)
+    without = given.build_model(LAYER, 0)
     assert with_it.predictor is not None
     assert torch.equal(with_it.predictor.predict_frame(window, SCENE), predictor.predict_frame(window, SCENE))
     assert without.predictor is None
@@ -142,21 +141,3 @@ def test_a_problem_has_models_with_and_without_it(predictor, window):
     torch.testing.assert_close(
         drawn[0].inputs.known + drawn[0].target * drawn[0].target_unit, drawn[1].target * drawn[1].target_unit
     )
-
-
-STUDY = """
-name = "corrected"
-task = {name = "TASK", predictor = "first"}
-search = {space = "space.toml"}
-stages = {baseline = {}}
-"""
-
-
-def test_a_study_file_finds_the_predictor_beside_itself(predictor, tmp_path):
-    save_model(predictor, tmp_path / "first", {})
-    file = tmp_path / "study.toml"
-    file.write_text(STUDY.replace("TASK", "acceleration"))
-    assert load_study(file).task.predictor == str((tmp_path / "first").resolve())
-    file.write_text(STUDY.replace("TASK", "density_rate"))
-    with pytest.raises(ConfigError, match="`predictor` is for steps"):
-        load_study(file)

@@ -13,7 +13,7 @@ from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
 from cconv.tasks.task import StepTask
-from cconv.validation import Horizon, Length, OneOf, PathText, Real, StrictModel, Value, Whole
+from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 MOST_UNROLLED = 10  # steps that an update differentiates through, whose states are all kept in memory
@@ -42,8 +42,7 @@ class TaskConfig(StrictModel):
 
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
     takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
-    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench; and
-    `predictor`, the checkpoint of a model that steps first, so that networks correct its step.
+    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
     """
 
     name: Annotated[str, OneOf(tuple(TASKS))]
@@ -52,7 +51,6 @@ class TaskConfig(StrictModel):
     features: tuple[str, ...] | None = Field(None, max_length=100)
     history: Whole | None = None
     horizon: Horizon | None = None
-    predictor: PathText | None = None
 
     @field_validator("kernel")
     @classmethod
@@ -80,8 +78,6 @@ class TaskConfig(StrictModel):
             TASKS[self.name].check_history(self.history)
         if self.horizon is not None and not issubclass(TASKS[self.name], StepTask):
             raise ValueError(f"`horizon` is for steps, and {self.name!r} is a field of one frame; remove it")
-        if self.predictor is not None and not issubclass(TASKS[self.name], StepTask):
-            raise ValueError(f"`predictor` is for steps, and {self.name!r} is a field of one frame; remove it")
         return self
 
     @property
@@ -135,14 +131,14 @@ class Configuration(NamedTuple):
         history: Frames that an answer depends on, the present one among them.
         network: Network settings.
         training: Training settings.
-        with_predictor: Whether the network corrects the step of the study's predictor, if there is one.
+        with_predictor: Whether the network corrects the step of the study's predictor, if it has one.
     """
 
     features: tuple[str, ...]
     history: int
     network: NetworkSettings
     training: TrainingConfig
-    with_predictor: bool = True
+    with_predictor: bool = False
 
 
 DEFAULTS = Configuration(TASKS["density_rate"].features, 1, ConvNetSettings(), TrainingConfig())

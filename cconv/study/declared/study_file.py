@@ -3,13 +3,16 @@
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from cconv.errors import ConfigError
 from cconv.networks import ConvNetSettings, NetworkTable
+from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import (
+    HISTORY,
+    WITH_PREDICTOR,
     Configuration,
     TaskConfig,
     TrainingConfig,
@@ -17,7 +20,9 @@ from cconv.study.declared.configuration import (
     check_asked,
     configure,
 )
-from cconv.study.declared.stage import Stage, check_names, check_order, included
+from cconv.study.declared.stage import Ridge, Stage, check_names, check_order, included
+from cconv.tasks import TASKS
+from cconv.tasks.task import StepTask
 from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole
 
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
@@ -60,6 +65,25 @@ class SearchConfig(StrictModel):
     give_up_above: Real = Field(10.0, ge=1e-12, le=1e9)
     trial_seconds: Real = Field(3600.0, ge=1e-3, le=1e7)
     concurrency: Whole | None = Field(None, ge=1, le=4096)
+
+
+class PredictorConfig(StrictModel):
+    """A single layer that steps first, and whose step the networks correct; least squares fits it before anything else.
+
+    It takes the features and the history of the study's task. `noise` and `loss` are as of a training.
+    """
+
+    network: NetworkTable
+    noise: Real = Field(1e-2, ge=0, le=1)
+    loss: Literal["mse", "balanced_mse"] = "balanced_mse"
+    ridge: Ridge = 1e-10
+
+    @field_validator("network")
+    @classmethod
+    def _is_a_single_layer(cls, network: NetworkSettings) -> NetworkSettings:
+        if not network.linear_with or network.linear_with.items() - network.model_dump().items():
+            raise ValueError("must have `layers = 1`, so that least squares can fit it")
+        return network
 
 
 class FinalistsConfig(StrictModel):
@@ -117,6 +141,7 @@ class StudyConfig(StrictModel):
     task: TaskConfig
     data: DataConfig = DataConfig()
     network: NetworkTable = ConvNetSettings()
+    predictor: PredictorConfig | None = None
     training: TrainingConfig = TrainingConfig()
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
@@ -167,6 +192,8 @@ class StudyConfig(StrictModel):
     @model_validator(mode="after")
     def _configuration_fits_the_task(self) -> "StudyConfig":
         check_asked(self.configuration, self.task.name)
+        if self.predictor is not None and not issubclass(TASKS[self.task.name], StepTask):
+            raise ValueError(f"`predictor` is for steps, and {self.task.name!r} is a field of one frame; remove it")
         return self
 
     @model_validator(mode="after")
@@ -181,7 +208,8 @@ class StudyConfig(StrictModel):
     @property
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
-        return Configuration(self.task.taken, self.task.usual_history, self.network, self.training)
+        task, corrects = self.task, self.predictor is not None
+        return Configuration(task.taken, task.usual_history, self.network, self.training, corrects)
 
     def configured(self, parameters: Mapping[str, Value]) -> Configuration:
         """What a trial has for which these hyperparameters are drawn.
@@ -191,7 +219,20 @@ class StudyConfig(StrictModel):
         """
         configuration = configure(parameters, self.configuration)
         check_asked(configuration, self.task.name)
+        self._check_predictor(configuration)
         return configuration
+
+    def _check_predictor(self, configuration: Configuration) -> None:
+        """Check that there is a predictor where one is to be corrected, and that it does not look back farther."""
+        if not configuration.with_predictor:
+            return
+        if self.predictor is None:
+            raise ConfigError(f"not possible ({WITH_PREDICTOR}: needs a table [predictor] in the study file)")
+        if configuration.history < self.task.usual_history:
+            raise ConfigError(
+                f"not possible ({HISTORY}: must be at least {self.task.usual_history}, that of the predictor, got "
+                f"{configuration.history})"
+            )
 
     @property
     def rungs(self) -> list[int]:

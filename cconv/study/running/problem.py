@@ -13,7 +13,6 @@ from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
-from cconv.models.checkpoint import load_model
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
 from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TrainingConfig
@@ -229,10 +228,8 @@ def load_problem(
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
     """
-    path = study.task.predictor
-    predictor = None if path is None else load_model(path, study.task.name).requires_grad_(False)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
-    return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid, predictor=predictor)
+    return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
 
 
 def provenance(study: StudyConfig, dataset: Dataset | None = None) -> dict:
