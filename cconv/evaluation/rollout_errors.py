@@ -1,6 +1,6 @@
 """Errors of rollouts that begin at samples, against the frames that are stored after them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,8 @@ from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.evaluation.rollout_metrics import squared_errors
-from cconv.models.model import Model
-from cconv.rollout.rollout import Diverged, advance
+from cconv.rollout.correctors import Corrector, correctors_of
+from cconv.rollout.rollout import Diverged, StepModel, advance
 from cconv.tasks.samples import Sample, StepSample
 
 
@@ -44,9 +44,10 @@ def worst_error(box: Box) -> float:
     return float(np.mean([(length / 2) ** 2 for length in box.lengths]))
 
 
-def rollouts_of(model: Model, samples: Iterable[Sample]) -> list[RolloutErrors]:
-    """Roll a model out from samples of its task, for as many frames as are known after each."""
-    return [rollout_errors(model.predict_frame, start) for start in starts(samples)]
+def rollouts_of(model: StepModel, samples: Iterable[Sample]) -> list[RolloutErrors]:
+    """Roll a model out, with its relaxation, from samples of its task, for as many frames as are known after each."""
+    correctors = correctors_of(model)
+    return [rollout_errors(model.predict_frame, start, correctors) for start in starts(samples)]
 
 
 def constant_rollouts(answer: Float[Tensor, " C"], samples: Iterable[Sample]) -> list[RolloutErrors]:
@@ -70,12 +71,14 @@ def starts(samples: Iterable[Sample]) -> list[StepSample]:
     return found
 
 
-def rollout_errors(predict: Callable[[Window, Scene], Tensor], start: StepSample) -> RolloutErrors:
-    """Errors of one rollout in each frame that is known after its start."""
+def rollout_errors(
+    predict: Callable[[Window, Scene], Tensor], start: StepSample, correctors: Sequence[Corrector] = ()
+) -> RolloutErrors:
+    """Errors of one rollout in each frame that is known after its start; arguments as of `advance`."""
     scene, future = start.scene, start.window.future
     worst = worst_error(scene.box)
     errors = np.full(len(future), worst)
-    path = advance(predict, start.task.integrator, start.window, scene)
+    path = advance(predict, start.task.integrator, start.window, scene, correctors=correctors)
     diverged = None
     try:
         for place, window in zip(range(len(future)), path, strict=False):

@@ -1,6 +1,7 @@
 """A model: a task, a network that predicts its target, and the standardisation of features and target."""
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from cconv.data.trajectory import Frame, Scene
 from cconv.data.window import Window
 from cconv.errors import ConfigError, ShapeError, shown
+from cconv.models.relaxation import Relaxation
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
 from cconv.neighbors import radius_graph
 from cconv.networks import NetworkTable
@@ -23,8 +25,8 @@ from cconv.sph.kernels import KERNELS, AbstractKernel
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.features import CONSTANT, WALLS, Inputs
 from cconv.tasks.samples import Sample
-from cconv.tasks.task import Task
-from cconv.validation import Length, StrictModel, Whole
+from cconv.tasks.task import StepTask, Task
+from cconv.validation import Length, StrictModel, Whole, validated
 
 MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
 
@@ -37,6 +39,7 @@ class ModelConfig(StrictModel):
     the training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
     features of the task that are inputs of the model.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
+    `relaxation` is what rollouts of a step apply after every frame.
     """
 
     task: str
@@ -50,6 +53,7 @@ class ModelConfig(StrictModel):
     wall_scalars: Whole = Field(ge=0, le=1)
     wall_vectors: Whole = Field(ge=0, le=1)
     network: NetworkTable
+    relaxation: Relaxation | None = None
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -62,6 +66,8 @@ class ModelConfig(StrictModel):
             raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
+        if self.relaxation is not None and not issubclass(TASKS[self.task], StepTask):
+            raise ValueError(f"`relaxation` is for steps, and {self.task!r} is a field of one frame")
         return self
 
     @property
@@ -141,6 +147,17 @@ class Model(nn.Module):
         for name, values in (("feature", features), ("target", targets)):
             self.register_buffer(f"{name}_mean", values.mean.float())
             self.register_buffer(f"{name}_scale", values.scale.float())
+
+    def relaxed_by(self, relaxation: Relaxation | None) -> "Model":
+        """The same model, which shares its weights, with another relaxation of its rollouts.
+
+        Raises:
+            ConfigError: If the model is of a field.
+        """
+        settings = self.config.model_dump() | {"relaxation": relaxation}
+        model = copy(self)
+        model.config = validated(ModelConfig, settings, "relaxation")
+        return model
 
     @property
     def num_parameters(self) -> int:

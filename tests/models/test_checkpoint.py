@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from systems import configured, problem
+from systems import configured, model_of, observed_and_sample, periodic_frame, periodic_scene, problem
 
 from cconv import load_model
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import read_card, save_model
+from cconv.models.relaxation import Relaxation
 
 
 @pytest.fixture
@@ -27,6 +28,40 @@ def test_round_trip_predicts_the_same(saved):
     inputs = given.valid_samples[0].inputs
     assert torch.equal(load_model(folder).predict(inputs), model.predict(inputs))
     assert read_card(folder) == {"valid_error": 0.5}
+
+
+def test_a_checkpoint_from_before_relaxations_has_none(saved):
+    _, _, folder = saved
+    config = json.loads((folder / "config.json").read_text())
+    del config["relaxation"]
+    (folder / "config.json").write_text(json.dumps(config))
+    assert load_model(folder).config.relaxation is None
+
+
+def test_a_relaxation_is_kept_and_only_models_of_steps_have_one(generator, saved, tmp_path):
+    observed, sample = observed_and_sample(periodic_frame(generator), periodic_scene(), "acceleration", generator)
+    model = model_of(configured(layers=1), periodic_scene(), "acceleration", [sample], generator)
+    relaxation = Relaxation(alpha=0.02, beta=0.3, loops=2)
+    save_model(model.relaxed_by(relaxation), tmp_path / "steps", {})
+    loaded = load_model(tmp_path / "steps")
+    assert loaded.config.relaxation == relaxation
+    assert model.config.relaxation is None
+    scene = periodic_scene()
+    assert torch.equal(loaded.predict_frame(observed, scene), model.predict_frame(observed, scene))
+    with pytest.raises(ConfigError, match="`relaxation` is for steps, and 'density_rate' is a field"):
+        saved[1].relaxed_by(relaxation)
+
+
+@pytest.mark.parametrize(
+    ("stored", "key"),
+    [({"alpha": -1.0}, "alpha"), ({"alpha": 0.02, "loops": 0}, "loops"), ({"alpha": 0.02, "gamma": 1.0}, "gamma")],
+)
+def test_a_relaxation_that_cannot_be_is_one_line(stored, key, saved):
+    _, _, folder = saved
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"relaxation": stored}))
+    with pytest.raises(ConfigError, match=rf"config\.json: .*relaxation\.{key}"):
+        load_model(folder)
 
 
 def test_saving_again_replaces_and_leaves_nothing_behind(saved):
