@@ -275,7 +275,7 @@ def recommended_checkpoint(path: Path) -> Path:
             f"{path}: the run has not recommended a model yet; continue it (`cconv study resume`), or name a "
             "checkpoint in it."
         )
-    return path / run.summary().chosen.checkpoint
+    return path / run.summary().offered_checkpoint
 
 
 def report(path: RunPath) -> None:

@@ -1,7 +1,7 @@
 """Errors of rollouts that begin at samples, against the frames that are stored after them."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from cconv.evaluation.rollout_metrics import squared_errors
 from cconv.rollout.correctors import Corrector, correctors_of
 from cconv.rollout.rollout import Diverged, StepModel, advance
 from cconv.tasks.samples import Sample, StepSample
+from cconv.tasks.task import as_step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,12 +27,14 @@ class RolloutErrors:
         frame: Index of the frame that it began with.
         errors: Mean squared error of the positions in each of its frames, (T,), at most `worst_error`.
         diverged: Why it ended early; None if it reached its last frame.
+        last: Positions in the last frame that it reached, (N, D), float64; those of the start if it reached none.
     """
 
     trajectory: str
     frame: int
     errors: np.ndarray
     diverged: str | None
+    last: Tensor
 
     @property
     def error(self) -> float:
@@ -46,8 +49,12 @@ def worst_error(box: Box) -> float:
 
 def rollouts_of(model: StepModel, samples: Iterable[Sample]) -> list[RolloutErrors]:
     """Roll a model out, with its relaxation, from samples of its task, for as many frames as are known after each."""
-    correctors = correctors_of(model)
-    return [rollout_errors(model.predict_frame, start, correctors) for start in starts(samples)]
+    return [rollout_errors_of(model, start, correctors_of(model)) for start in starts(samples)]
+
+
+def rollout_errors_of(model: StepModel, start: StepSample, correctors: Sequence[Corrector] = ()) -> RolloutErrors:
+    """Errors of one rollout of a model of a step task, whose integrator may be another than that of the sample."""
+    return rollout_errors(model.predict_frame, replace(start, task=as_step(model.task)), correctors)
 
 
 def constant_rollouts(answer: Float[Tensor, " C"], samples: Iterable[Sample]) -> list[RolloutErrors]:
@@ -79,11 +86,13 @@ def rollout_errors(
     worst = worst_error(scene.box)
     errors = np.full(len(future), worst)
     path = advance(predict, start.task.integrator, start.window, scene, correctors=correctors)
-    diverged = None
+    diverged, last = None, start.window.present.double()
     try:
         for place, window in zip(range(len(future)), path, strict=False):
             found = float(squared_errors(window.present[None], future[place][None], scene.box))
-            errors[place] = min(found, worst)
+            errors[place], last = min(found, worst), window.present
     except Diverged as error:
         diverged = error.reason
-    return RolloutErrors(trajectory=start.trajectory, frame=start.window.frame, errors=errors, diverged=diverged)
+    return RolloutErrors(
+        trajectory=start.trajectory, frame=start.window.frame, errors=errors, diverged=diverged, last=last
+    )

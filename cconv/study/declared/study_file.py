@@ -18,6 +18,8 @@ from cconv.study.declared.configuration import (
     configure,
 )
 from cconv.study.declared.stage import Stage, check_names, check_order, included
+from cconv.tasks import TASKS
+from cconv.tasks.task import StepTask
 from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Value, Whole
 
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
@@ -167,6 +169,13 @@ class StudyConfig(StrictModel):
     @model_validator(mode="after")
     def _configuration_fits_the_task(self) -> "StudyConfig":
         check_asked(self.configuration, self.task.name)
+        return self
+
+    @model_validator(mode="after")
+    def _stages_fit_the_task(self) -> "StudyConfig":
+        for name, stage in self.stages.items():
+            if stage.only_for_steps and not issubclass(TASKS[self.task.name], StepTask):
+                raise ValueError(f"stage `{name}` is for steps, and {self.task.name!r} is a field; remove it")
         return self
 
     @model_validator(mode="after")
