@@ -347,6 +347,26 @@ def test_a_damaged_stored_frame_is_told_before_anything_is_predicted(
     assert [file.name for file in tmp_path.iterdir()] == ["data"]
 
 
+def test_the_integrator_adds_the_force_of_data_that_say_one_and_is_refused_where_there_is_none(
+    steps_folder, cconv, tmp_path
+):
+    text = STUDY.format(layers=1).replace("horizon = 5", 'horizon = 5\nexternal_force = "integrator"')
+    (tmp_path / "study.toml").write_text(text)
+    fit = ("fit", tmp_path / "study.toml", "--data", steps_folder)
+    outcome = cconv(*fit, "--out", tmp_path / "no")
+    assert_one_clear_line(outcome, "there is no external force, and an integrator is to add it")
+    assert not (tmp_path / "no").exists()
+    assert cconv(*fit, "--out", tmp_path / "model", "--set", "data.force=[0, -0.5]")[0] == 0
+    config = json.loads((tmp_path / "model" / "config.json").read_text())
+    assert config["force_travel"] > 0
+    assert cconv("evaluate", tmp_path / "model", "--json")[0] == 0
+    assert cconv("rollout", tmp_path / "model", "--frames", 3)[0] == 0
+    field = text.replace('"acceleration"', '"density_rate"').replace("history = 3", "").replace("horizon = 5", "")
+    (tmp_path / "study.toml").write_text(field.replace("noise = 0.01", ""))
+    outcome = cconv(*fit, "--out", tmp_path / "no")
+    assert_one_clear_line(outcome, "task.external_force: is for steps, and 'density_rate' is a field of one frame")
+
+
 def test_a_film_is_written_where_ffmpeg_is_found(fitted, cconv, tmp_path, monkeypatch):
     from matplotlib.animation import FFMpegWriter
 

@@ -4,7 +4,7 @@ from collections.abc import Collection, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,7 @@ from cconv.tasks import TASKS, task_named
 from cconv.tasks.features import CONSTANT, WALLS, Inputs
 from cconv.tasks.samples import Sample
 from cconv.tasks.task import StepTask, Task
-from cconv.validation import Length, StrictModel, Whole, validated
+from cconv.validation import Length, Real, StrictModel, Whole, validated
 
 MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
 
@@ -39,7 +39,8 @@ class ModelConfig(StrictModel):
     the training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
     features of the task that are inputs of the model.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
-    `relaxation` is what rollouts of a step apply after every frame.
+    `relaxation` is what rollouts of a step apply after every frame. `force_travel` is that of a step task to which the
+    integrator adds the external force, in particle spacings.
     """
 
     task: str
@@ -54,6 +55,7 @@ class ModelConfig(StrictModel):
     wall_vectors: Whole = Field(ge=0, le=1)
     network: NetworkTable
     relaxation: Relaxation | None = None
+    force_travel: Annotated[Real, Field(ge=0, le=1e6)] | None = None
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -66,14 +68,15 @@ class ModelConfig(StrictModel):
             raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
-        if self.relaxation is not None and not issubclass(TASKS[self.task], StepTask):
-            raise ValueError(f"`relaxation` is for steps, and {self.task!r} is a field of one frame")
+        for name in ("relaxation", "force_travel"):
+            if getattr(self, name) is not None and not issubclass(TASKS[self.task], StepTask):
+                raise ValueError(f"`{name}` is for steps, and {self.task!r} is a field of one frame")
         return self
 
     @property
     def asked(self) -> Task:
         """Task of the model."""
-        return task_named(self.task, self.kernel, self.relative_smoothing_length, self.history)
+        return task_named(self.task, self.kernel, self.relative_smoothing_length, self.history, self.force_travel)
 
     @property
     def fluid_features(self) -> tuple[str, ...]:
@@ -285,6 +288,7 @@ def build_model(
         particle_spacing=scene.particle_spacing,
         frame_dt=scene.frame_dt,
         history=task.history,
+        force_travel=task.force_travel if isinstance(task, StepTask) else None,
         features=tuple(name for name in task.features if name in names),
         wall_scalars=walls.scalars,
         wall_vectors=walls.vectors,

@@ -29,7 +29,7 @@ def relaxations_chart(relaxed: Relaxed) -> Figure:
         _draw(axes, model, relaxed.chosen[name], norm)
         axes.set_title(name, parse_math=False)
         axes.set(yscale="log", xlabel="loops of the relaxation in a frame, 0 for none")
-    panels[0].set_ylabel("measures of the rollouts ÷ those without relaxation")
+    panels[0].set_ylabel("measures ÷ without relaxation")
     points = panels[-1].collections[0]
     figure.colorbar(points, ax=list(panels), label="alpha, size of a shift")
     return figure

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -118,9 +118,9 @@ class WindowSamples(Sequence[StepSample]):
         """The window of a sample, no longer than the history of the task."""
         return self.windows[index].ending(self.task.history)
 
-    def of_history(self, history: int) -> "WindowSamples":
-        """Samples of the same presents whose answers depend on fewer frames."""
-        return WindowSamples(self.windows, self.scene, replace(self.task, history=history))
+    def of_task(self, task: StepTask) -> "WindowSamples":
+        """Samples of the same presents for another task, whose history is no longer."""
+        return WindowSamples(self.windows, self.scene, task)
 
     @cached_property
     def spread(self) -> list[StepSample]:

@@ -14,6 +14,7 @@ from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.tasks.external_force import WithForceOfScene
 from cconv.tasks.features import (
     CONSTANT,
     DENSITY,
@@ -143,14 +144,23 @@ class StepTask(Task):
     """The step to the next stored frame, from a window of frames up to the present one.
 
     Attributes:
-        integrator: Turns answers into the next frame, and the next frame into the answer that leads to it.
+        moved_by: Turns whole accelerations into the next frame.
+        force_travel: Standard deviation of the displacements of a frame along an axis, in particle spacings, where the
+            integrator adds the external force of the scene, smoothed over so much; None where networks know the force
+            or learn it.
     """
 
-    integrator: ClassVar[Integrator]
+    moved_by: ClassVar[Integrator]
     objective = "rollout_mse"
     histories = (2, 20)
 
     history: int = 6
+    force_travel: float | None = None
+
+    @property
+    def integrator(self) -> Integrator:
+        """Turns answers into the next frame, and the next frame into the answer that leads to it."""
+        return self.moved_by if self.force_travel is None else WithForceOfScene(self.moved_by, self.force_travel)
 
     def target(self, window: Window, scene: Scene) -> Float[Tensor, "M C"]:
         """Answer (M, C) that leads the fluid to the first frame of the window's future, in the units of the data."""

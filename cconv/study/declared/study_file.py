@@ -190,7 +190,8 @@ class StudyConfig(StrictModel):
     @property
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
-        return Configuration(self.task.taken, self.task.usual_history, self.network, self.training)
+        task = self.task
+        return Configuration(task.taken, task.usual_history, self.network, self.training, task.external_force)
 
     def configured(self, parameters: Mapping[str, Value]) -> Configuration:
         """What a trial has for which these hyperparameters are drawn.

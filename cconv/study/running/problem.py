@@ -9,18 +9,28 @@ import torch
 
 from cconv.data.dataset import Dataset, open_dataset
 from cconv.data.metadata import OVERRIDES
+from cconv.data.smoothed_force import travel_deviation
 from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
-from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TrainingConfig
+from cconv.study.declared.configuration import BY_INTEGRATOR, MOST_PUSHED, Configuration, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
+from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import features_in
-from cconv.tasks.samples import HORIZON, Sample, WindowSamples, iterate_samples, learned_samples, rolled_samples
-from cconv.tasks.task import StepTask, Task, as_field
+from cconv.tasks.samples import (
+    HORIZON,
+    Sample,
+    StepSample,
+    WindowSamples,
+    iterate_samples,
+    learned_samples,
+    rolled_samples,
+)
+from cconv.tasks.task import StepTask, Task, as_field, as_step
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
 from cconv.training.losses import LOSSES
@@ -56,39 +66,54 @@ class Problem:
     @property
     def typical_samples(self) -> Sequence[Sample]:
         """Training samples whose means and variances are those of all: all of them, or windows spread over them."""
-        return self._typical(self.task.history)
+        return self._typical(self.task)
 
     def task_of(self, configuration: Configuration) -> Task:
-        """Task of the models of a configuration, with its history."""
-        return replace(self.task, history=configuration.history)
+        """Task of the models of a configuration, with its history, and with the force that its integrator adds.
 
-    def _typical(self, history: int) -> Sequence[Sample]:
-        samples = self._training_samples(history)
+        Raises:
+            ConfigError: If there is no external force to add.
+        """
+        task = replace(self.task, history=configuration.history)
+        if configuration.external_force != BY_INTEGRATOR:
+            return task
+        force_to_add(self.scene)
+        return replace(as_step(task), force_travel=self._travel)
+
+    def _typical(self, task: Task) -> Sequence[Sample]:
+        samples = self._training_samples(task)
         return samples.spread if isinstance(samples, WindowSamples) else samples
 
-    def _training_samples(self, history: int) -> Sequence[Sample]:
-        """Training samples of models with some history; those of each are made once."""
+    def _training_samples(self, task: Task) -> Sequence[Sample]:
+        """Training samples of models of some task; those of each are made once."""
         if not isinstance(self.train_samples, WindowSamples):
             return self.train_samples
-        if history not in self._of_history:
-            self._of_history[history] = self.train_samples.of_history(history)
-        return self._of_history[history]
+        if task not in self._of_task:
+            self._of_task[task] = self.train_samples.of_task(as_step(task))
+        return self._of_task[task]
 
     @cached_property
-    def _of_history(self) -> dict[int, WindowSamples]:
+    def _of_task(self) -> dict[Task, WindowSamples]:
         return {}
+
+    @cached_property
+    def _travel(self) -> float:
+        """Standard deviation of displacements of a frame along an axis in training windows, in particle spacings."""
+        windows = [sample.window for sample in self.typical_samples if isinstance(sample, StepSample)]
+        moved = torch.cat([each.last_displacements(self.scene.box)[each.is_fluid] for each in windows])
+        return travel_deviation(moved.std(dim=0, correction=0).tolist()) / self.scene.particle_spacing
 
     def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
         """Compute the error of a model on the validation split; without a cache all geometries are computed anew."""
         return self.objective.error(model, self.valid_samples, geometry)
 
-    def examples(self, training: TrainingConfig, seed: int, history: int) -> Examples:
-        """Make the examples of a training, with its noise and pushforward, of a model with some history.
+    def examples(self, training: TrainingConfig, seed: int, task: Task) -> Examples:
+        """Make the examples of a training, with its noise and pushforward, of a model of some task, of `task_of`.
 
         Raises:
             ConfigError: If one of them is asked for where there are no windows.
         """
-        samples = self._training_samples(history)
+        samples = self._training_samples(task)
         if not training.moving:
             return StoredExamples(samples)
         if not isinstance(samples, WindowSamples):
@@ -105,7 +130,7 @@ class Problem:
 
         With noise, each place gives one noisy example; the loss says how much each frame counts.
         """
-        examples = self.examples(training, seed, model.task.history)
+        examples = self.examples(training, seed, model.task)
         drawn = (examples.draw(place, 0, model) for place in places)
         solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
 
@@ -122,12 +147,13 @@ class Problem:
 
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """Build an untrained model with the initial weights of `init_seed`."""
+        task = self.task_of(configuration)
         return build_model(
             configuration.network,
-            self.task_of(configuration),
+            task,
             self.features_of(configuration),
             self.scene,
-            self._typical(configuration.history),
+            self._typical(task),
             torch.Generator().manual_seed(init_seed),
         )
 
@@ -221,7 +247,12 @@ def load_problem(
         dataset: Its data.
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
+
+    Raises:
+        ConfigError: If the integrator is to add an external force where there is none.
     """
+    if study.task.external_force == BY_INTEGRATOR:
+        force_to_add(dataset.scene)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
     return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
 
