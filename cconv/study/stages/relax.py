@@ -35,8 +35,8 @@ class RelaxStage(Stage):
     """Search the SPH relaxation of the rollouts of the recommended model, and store it in a checkpoint of its own.
 
     A search tries at most `candidates` relaxations on `starts` validation rollouts of `frames` frames; None goes on as
-    long as frames are stored. It begins none after `seconds`, which the recommended and the most accurate finalist
-    share if they are not the same.
+    long as frames are stored. It begins none after `seconds` of such rollouts, which the recommended and the most
+    accurate finalist share if they are not the same.
     """
 
     kind: Literal["relax"] = "relax"
@@ -95,7 +95,7 @@ class RelaxStage(Stage):
         for number in session.progress(range(self.candidates + 1), f"relaxation of {entry.id}"):
             if number < len(tried):
                 continue
-            if number and sum(each.seconds for each in tried) > seconds:
+            if number and sum(each.seconds for each in tried[1:]) > seconds:
                 break
             relaxation = propose_relaxation(tried, session.seed_of(stage)) if number else None
             tried.append(_try(model, relaxation, samples, tried))
