@@ -5,7 +5,7 @@ A data set declares its force in words and numbers, because code that is found b
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import ClassVar, TypeGuard
 
@@ -16,6 +16,9 @@ from torch import Tensor
 from cconv.errors import ConfigError, did_you_mean, shown
 
 LARGEST = 1e12  # number of a declaration, in any unit
+_FARTHEST = 8.0  # standard deviations, beyond which nothing is felt of a change of sign
+
+Smoothed = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length per time squared
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,14 @@ class Force(ABC):
     @abstractmethod
     def __call__(self, positions: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
         """Accelerations (N, D) at positions (N, D), length per time squared."""
+
+    @abstractmethod
+    def smoothed(self, deviation: float) -> Smoothed:
+        """Its mean over normally distributed displacements around each position.
+
+        Args:
+            deviation: Standard deviation of each component of these, length; 0 gives the force itself.
+        """
 
     def declaration(self) -> dict:
         """Name and parameters, as a data set declares them; `force_declared` reads them."""
@@ -71,6 +82,10 @@ class ConstantForce(Force):
     def __call__(self, positions: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
         """The acceleration at each position."""
         return torch.tensor(self.acceleration, dtype=positions.dtype).expand_as(positions)
+
+    def smoothed(self, deviation: float) -> Smoothed:
+        """The force itself, whatever the displacements; see `Force.smoothed`."""
+        return self
 
 
 @dataclass(frozen=True)
@@ -108,6 +123,27 @@ class ReversePoiseuilleForce(Force):
         accelerations = torch.zeros_like(positions)
         accelerations[:, 0] = torch.where(upper, -self.magnitude, self.magnitude)
         return accelerations
+
+    def smoothed(self, deviation: float) -> Smoothed:
+        r"""Its mean in closed form, a sum over the places k L/2 where the sign changes; see `Force.smoothed`.
+
+        .. math:: g_x = g \sum_k (-1)^k \operatorname{erf} \frac{y - k L / 2}{\sqrt 2 \sigma}
+
+        Source: the code of Neural SPH (Toshev et al., ICML 2024), which has the terms k = 0, 1, 2 in a box of height 2.
+        """
+        width = min(deviation, self.height)  # what is left with more is below 1e-8 of the magnitude
+        beyond = math.ceil(2 * _FARTHEST * width / self.height)
+
+        def mean(positions: Tensor) -> Tensor:
+            place = torch.remainder(positions[:, 1], self.height)
+            accelerations = torch.zeros_like(positions)
+            for turn in range(-beyond, 3 + beyond):
+                sign = -1.0 if turn % 2 else 1.0
+                away = place - turn * self.height / 2
+                accelerations[:, 0] += sign * self.magnitude * torch.erf(away / (math.sqrt(2) * width))
+            return accelerations
+
+        return mean if width > 0 else self
 
 
 FORCES: dict[str, type[Force]] = {force.name: force for force in (ConstantForce, ReversePoiseuilleForce)}

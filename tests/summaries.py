@@ -13,6 +13,8 @@ from cconv.study.records.found import (
     ParameterImportance,
     PartialDependence,
     References,
+    Relaxed,
+    RelaxedModel,
     ReplayedStrategy,
     RungAudit,
     RungImportance,
@@ -20,6 +22,7 @@ from cconv.study.records.found import (
     SeedVariance,
     SpentUpdates,
     TrialPoint,
+    TriedRelaxation,
 )
 from cconv.study.records.rollouts import FinalistRollouts, FlowSeries, RolledTrajectory
 from cconv.study.records.summary import (
@@ -92,7 +95,7 @@ def whole_summary(summary: Summary) -> Summary:
         ),
         mean_predictor=MeanPredictor(valid=4.5, test=1.58),
         selection=_selection(ids),
-        **parts(summary.baseline),
+        **parts(summary.baseline) | {"relaxed": relaxations(summary.recommended.id)},
     )
 
 
@@ -127,6 +130,35 @@ def parts(baseline: str) -> dict:
         "ablation": _ablation(),
         "convergence": {baseline: Convergence(points=[_budget(135), _budget(600)], still_falling=True)},
     }
+
+
+def tried_relaxation(loops: int, quality: float, *, alpha: float = 0.02, reason: str = "") -> TriedRelaxation:
+    """A relaxation whose measures are all of this quality; a reason is why a rollout diverged."""
+    return TriedRelaxation(
+        alpha=alpha if loops else 0.0,
+        beta=0.3 if loops else 0.0,
+        loops=loops,
+        quality=quality,
+        mse=1e-4 * quality,
+        sinkhorn=1e-6 * quality,
+        density=0.01 * quality,
+        diverged=1 if reason else 0,
+        reason=reason,
+        seconds=2.0,
+    )
+
+
+def relaxations(name: str, checkpoint: str | None = "relaxed") -> Relaxed:
+    """Relaxations of a finalist, of which the fourth is chosen, or none at all if no checkpoint is offered."""
+    tried = [
+        tried_relaxation(0, 1.0),
+        tried_relaxation(1, 0.9, alpha=0.005),
+        tried_relaxation(5, 0.2, alpha=0.03),
+        tried_relaxation(3, 0.21),
+        tried_relaxation(5, 30.0, alpha=0.1, reason="A relaxation shifted a particle by 2 particle spacings"),
+    ]
+    model = RelaxedModel(checkpoint=f"finalists/{name}/seed_1/checkpoint", frames=20, rollouts=2, tried=tried)
+    return Relaxed(models={name: model}, chosen={name: 3 if checkpoint else 0}, checkpoint=checkpoint)
 
 
 def finalist(name: str, *, updates: int = 81, fall_at_the_end: float | None = None, error: float = 0.01):

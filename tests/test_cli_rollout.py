@@ -15,6 +15,8 @@ from particle_files import record_frames, write_parts
 
 from cconv.data.dataset import open_dataset
 from cconv.forces import ConstantForce
+from cconv.models.checkpoint import load_model, read_card, save_model
+from cconv.models.relaxation import Relaxation
 from cconv.report.particles import animation_suffixes
 
 STUDY = """
@@ -41,6 +43,7 @@ space = "none.toml"
 grace_updates = 3
 [stages.baseline]
 """
+OWN = Relaxation(alpha=0.02, beta=0.3, loops=3)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +126,43 @@ def test_relaxation_spreads_the_particles_of_a_rollout_and_is_told(fitted, cconv
     assert off_rest[1] < off_rest[0]
 
 
+@pytest.fixture(scope="module")
+def relaxed_checkpoint(fitted, tmp_path_factory):
+    """The same checkpoint with a relaxation of its own."""
+    place = tmp_path_factory.mktemp("relaxed") / "model"
+    save_model(load_model(fitted).relaxed_by(OWN), place, read_card(fitted))
+    return place
+
+
+def test_the_relaxation_of_a_checkpoint_is_applied_replaced_or_left_out(fitted, relaxed_checkpoint, cconv):
+    def rolled(folder, *options):
+        facts = json.loads(cconv("rollout", folder, "--frames", 6, "--json", *options)[1])
+        return facts["relaxation"], facts["metrics"]["mse"]
+
+    assert rolled(relaxed_checkpoint) == rolled(fitted, "--relax", "0.02,0.3,3")
+    assert rolled(relaxed_checkpoint)[0] == OWN.model_dump()
+    assert rolled(relaxed_checkpoint, "--no-relax") == rolled(fitted)
+    assert rolled(relaxed_checkpoint, "--relax", "0.01,0,1") == rolled(fitted, "--relax", "0.01,0,1")
+    assert rolled(relaxed_checkpoint)[1] != rolled(fitted)[1]
+    said = cconv("rollout", relaxed_checkpoint, "--frames", 3)[1]
+    assert "ms per frame, the relaxation included: alpha 0.02, beta 0.3, loops 3" in said
+
+
+def test_an_evaluation_rolls_out_with_the_relaxation_of_the_checkpoint(fitted, relaxed_checkpoint, cconv):
+    plain, relaxed = (json.loads(cconv("evaluate", each, "--json")[1]) for each in (fitted, relaxed_checkpoint))
+    assert (plain["relaxation"], relaxed["relaxation"]) == (None, OWN.model_dump())
+    assert plain["rollout_mse"] != relaxed["rollout_mse"]
+    assert plain["first_frame_mse"] != relaxed["first_frame_mse"]
+    assert "Rollouts with relaxation: alpha 0.02, beta 0.3, loops 3" in cconv("evaluate", relaxed_checkpoint)[1]
+
+
+def test_a_shift_of_more_than_a_spacing_ends_the_rollout_with_one_line(fitted, cconv):
+    code, printed, said = cconv("rollout", fitted, "--frames", 6, "--relax", "1000,0,1")
+    assert (code, printed) == (1, "")
+    assert "particle spacings in one loop, and at most 1 is allowed; take a smaller `alpha`" in said
+    assert len(said.strip().splitlines()) == 1
+
+
 def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
     code, printed, _ = cconv("rollout", fitted, "--json")
     facts = json.loads(printed)
@@ -144,6 +184,7 @@ def test_without_a_folder_the_metrics_are_printed_as_json(fitted, cconv):
         (["--split", "tset"], "has no split 'tset'"),
         (["--relax", "0.02,a"], "`--relax` must be three numbers ALPHA,BETA,LOOPS"),
         (["--relax", "-1,0,3"], "alpha"),
+        (["--relax", "0.02,0,3", "--no-relax"], "`--relax` and `--no-relax` exclude each other"),
         (["--vtk"], "`--vtk` writes to DIR/vtk and needs `--out DIR`"),
     ],
 )
@@ -304,6 +345,26 @@ def test_a_damaged_stored_frame_is_told_before_anything_is_predicted(
     outcome = cconv("rollout", fitted, "--data", tmp_path / "data", "--out", tmp_path / "out")
     assert_one_clear_line(outcome, "trajectory test/00000, frame 9: `position` has a NaN")
     assert [file.name for file in tmp_path.iterdir()] == ["data"]
+
+
+def test_the_integrator_adds_the_force_of_data_that_say_one_and_is_refused_where_there_is_none(
+    steps_folder, cconv, tmp_path
+):
+    text = STUDY.format(layers=1).replace("horizon = 5", 'horizon = 5\nexternal_force = "integrator"')
+    (tmp_path / "study.toml").write_text(text)
+    fit = ("fit", tmp_path / "study.toml", "--data", steps_folder)
+    outcome = cconv(*fit, "--out", tmp_path / "no")
+    assert_one_clear_line(outcome, "there is no external force, and an integrator is to add it")
+    assert not (tmp_path / "no").exists()
+    assert cconv(*fit, "--out", tmp_path / "model", "--set", "data.force=[0, -0.5]")[0] == 0
+    config = json.loads((tmp_path / "model" / "config.json").read_text())
+    assert config["force_travel"] > 0
+    assert cconv("evaluate", tmp_path / "model", "--json")[0] == 0
+    assert cconv("rollout", tmp_path / "model", "--frames", 3)[0] == 0
+    field = text.replace('"acceleration"', '"density_rate"').replace("history = 3", "").replace("horizon = 5", "")
+    (tmp_path / "study.toml").write_text(field.replace("noise = 0.01", ""))
+    outcome = cconv(*fit, "--out", tmp_path / "no")
+    assert_one_clear_line(outcome, "task.external_force: is for steps, and 'density_rate' is a field of one frame")
 
 
 def test_a_film_is_written_where_ffmpeg_is_found(fitted, cconv, tmp_path, monkeypatch):

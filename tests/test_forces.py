@@ -89,3 +89,31 @@ def test_a_force_that_cannot_be_is_refused_with_the_reason(declared, message):
 def test_reverse_poiseuille_needs_two_dimensions():
     with pytest.raises(ConfigError, match="2 or 3 dimensions, got 1"):
         force_declared({"name": "reverse_poiseuille", "magnitude": 1.0, "height": 2.0}, 1)
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.1, 0.4, 3.0])
+def test_the_smoothed_reverse_poiseuille_force_is_the_mean_over_displacements(deviation):
+    """For any deviation, also of many heights, and with the symmetries of the force."""
+    force = ReversePoiseuilleForce(1.5, 2.0)
+    heights = torch.linspace(-3, 3, 25, dtype=torch.float64)
+    positions = torch.stack([torch.zeros_like(heights), heights], dim=1)
+    mean, offsets = torch.zeros_like(heights), torch.linspace(-6, 6, 24_001, dtype=torch.float64)
+    weights = torch.exp(-(offsets**2) / 2)
+    for place, height in enumerate(heights):
+        moved = height + deviation * offsets
+        values = force(torch.stack([torch.zeros_like(moved), moved], dim=1))[:, 0]
+        mean[place] = (weights * values).sum() / weights.sum()
+    found = force.smoothed(deviation)
+    torch.testing.assert_close(found(positions)[:, 0], mean, rtol=0, atol=2e-3)
+    assert (found(positions)[:, 1] == 0).all()
+    odd = found(-positions)[:, 0]
+    torch.testing.assert_close(odd, -found(positions)[:, 0], rtol=0, atol=1e-12)
+    later = positions + torch.tensor([0.0, 2.0])
+    torch.testing.assert_close(found(later), found(positions), rtol=0, atol=1e-12)
+
+
+def test_a_force_smoothed_over_nothing_is_itself_and_a_constant_one_always():
+    positions = torch.rand(9, 2, dtype=torch.float64)
+    for force in (ConstantForce((0.5, -9.81)), ReversePoiseuilleForce(1.5, 2.0)):
+        assert torch.equal(force.smoothed(0.0)(positions), force(positions))
+    assert torch.equal(ConstantForce((0.5, -9.81)).smoothed(0.7)(positions), ConstantForce((0.5, -9.81))(positions))

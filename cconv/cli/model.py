@@ -171,6 +171,7 @@ def evaluate(
         "objective": objective.name,
         **_errors_by(objective, model, asked, training, show_progress(asked, f"evaluate {split}")),
         "num_parameters": model.num_parameters,
+        "relaxation": None if model.config.relaxation is None else model.config.relaxation.model_dump(),
         **scale_facts(dataset.scene, model.config),
     }
     if not math.isfinite(facts[objective.name]):
@@ -220,6 +221,8 @@ def _print_evaluation(facts: Mapping, objective: "Objective") -> None:
         f"{facts['split']}: {', '.join(figures)} over {facts['frames']} frames "
         f"({facts['task']}, {facts['num_parameters']:,} parameters)"
     ]
+    if facts["relaxation"] is not None:
+        lines.append(relaxation_words(facts["relaxation"], "Rollouts with relaxation: "))
     if own is not None and not math.isclose(own, error, rel_tol=0.005):
         lines.append(f"By the variance of these data instead of the training split's: {own:.6g}")
     if mean is not None:
@@ -240,6 +243,13 @@ def other_scales(facts: Mapping) -> Iterator[tuple[str, float, float]]:
         found, trained = facts[name], facts[f"trained_at_{name}"]
         if trained is not None and not math.isclose(found, trained, rel_tol=tolerance):
             yield what, found, trained
+
+
+def relaxation_words(relaxation: Mapping | None, lead: str) -> str:
+    """Say which relaxation was applied, after a lead; nothing if none was."""
+    if relaxation is None:
+        return ""
+    return f"{lead}alpha {relaxation['alpha']:g}, beta {relaxation['beta']:g}, loops {relaxation['loops']}"
 
 
 def scale_facts(scene: "Scene", config: "ModelConfig") -> dict[str, float | None]:
@@ -265,7 +275,7 @@ def recommended_checkpoint(path: Path) -> Path:
             f"{path}: the run has not recommended a model yet; continue it (`cconv study resume`), or name a "
             "checkpoint in it."
         )
-    return path / run.summary().chosen.checkpoint
+    return path / run.summary().offered_checkpoint
 
 
 def report(path: RunPath) -> None:

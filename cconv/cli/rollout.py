@@ -9,7 +9,7 @@ import typer
 
 from cconv.cli.console import INTERRUPTED, errors, print_findings, print_json, results, show_progress
 from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
-from cconv.cli.model import other_scales, recommended_checkpoint, scale_facts
+from cconv.cli.model import other_scales, recommended_checkpoint, relaxation_words, scale_facts
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError, shown
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cconv.data.trajectory import Scene
     from cconv.evaluation.recorded_rollout import RecordedRollout
     from cconv.models.model import ModelConfig
-    from cconv.rollout.correctors import SPHRelaxation
+    from cconv.rollout.correctors import Corrector, SPHRelaxation
 
 METRICS = "metrics.json"
 SOLVER_REPEATS = 3
@@ -55,9 +55,11 @@ def rollout(
         typer.Option(
             metavar="ALPHA,BETA,LOOPS",
             help="Relax the particles by SPH after every frame, e.g. 0.02,0.3,3: LOOPS shifts of size ALPHA, with a "
-            "viscosity of BETA times the pressure (Neural SPH). Networks whose particles clump often hold on longer.",
+            "viscosity of BETA times the pressure (Neural SPH). Networks whose particles clump often hold on longer. "
+            "The default is what the checkpoint says.",
         ),
     ] = None,
+    no_relax: Annotated[bool, typer.Option("--no-relax", help="Leave out the relaxation of the checkpoint.")] = False,
     vtk: Annotated[bool, typer.Option("--vtk", help="Also write VTK files for ParaView, to DIR/vtk.")] = False,
     mass: Mass = None,
     particle_spacing: Spacing = None,
@@ -75,6 +77,7 @@ def rollout(
     from cconv.data.stored_frames import StoredFrames
     from cconv.evaluation.recorded_rollout import asked_rollout, record_rollout, rollout_facts, write_rollout
     from cconv.models.checkpoint import load_model, read_card
+    from cconv.rollout.correctors import SPHRelaxation, correctors_of
     from cconv.rollout.rollout import Diverged
     from cconv.study.running.problem import open_card_data
     from cconv.tasks.task import as_step
@@ -83,13 +86,13 @@ def rollout(
         raise ConfigError("`--vtk` writes to DIR/vtk and needs `--out DIR`.")
     if frames is not None and frames < 1:
         raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
-    relaxation = None if relax is None else _relaxation(relax)
+    given_correctors = _given_correctors(relax, no_relax)
     checkpoint = recommended_checkpoint(checkpoint)
     model, card = load_model(checkpoint), read_card(checkpoint)
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     stored = StoredFrames(dataset, split, trajectory)
-    correctors = () if relaxation is None else (relaxation,)
+    correctors = correctors_of(model) if given_correctors is None else given_correctors
     asked = asked_rollout(as_step(model.task), stored, dataset.scene, start, frames, correctors)
     try:
         if out is None:
@@ -104,7 +107,7 @@ def rollout(
         print_findings(trajectory_findings(dataset.trajectory(split, trajectory), dataset.scene))
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": len(asked.begun), **rollout_facts(recorded)}
-    facts["relaxation"] = None if relaxation is None else asdict(relaxation)
+    facts["relaxation"] = next((asdict(each) for each in correctors if isinstance(each, SPHRelaxation)), None)
     facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:
         _write_beside(out, facts, stored.first_frame + start, vtk)
@@ -114,6 +117,15 @@ def rollout(
         _print(facts, out)
     if recorded.ended is not None:
         raise typer.Exit(INTERRUPTED if recorded.ended == "interrupted" else 1)
+
+
+def _given_correctors(relax: str | None, no_relax: bool) -> "tuple[Corrector, ...] | None":
+    """Read `--relax` and `--no-relax`; None leaves it to the checkpoint."""
+    if relax is not None and no_relax:
+        raise ConfigError("`--relax` and `--no-relax` exclude each other; give one of them.")
+    if no_relax:
+        return ()
+    return None if relax is None else (_relaxation(relax),)
 
 
 def _relaxation(text: str) -> "SPHRelaxation":
@@ -195,8 +207,7 @@ def _print(facts: dict, out: Path | None) -> None:
     lines.append(f"  Chamfer distance                           {metrics['chamfer'][-1]:.4g}")
     lines.append(f"Sinkhorn divergence at frame {metrics['sinkhorn_frames'][-1]}: {metrics['sinkhorn'][-1]:.4g}")
     own, solver = facts["milliseconds_per_frame"], facts["solver"]
-    relaxed = "" if facts["relaxation"] is None else ", the relaxation included"
-    lines.append(f"{own:.4g} ms per frame{relaxed}")
+    lines.append(f"{own:.4g} ms per frame{relaxation_words(facts['relaxation'], ', the relaxation included: ')}")
     if "not_timed" in solver:
         lines.append(f"The solver was not timed: {solver['not_timed']}")
     else:

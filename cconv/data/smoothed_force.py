@@ -21,6 +21,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
+from cconv.forces import ReversePoiseuilleForce
 
 Accelerating = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length/time²
 
@@ -112,13 +113,10 @@ def _rule(deviation: float, nodes: int) -> list[tuple[float, float]]:
 
 
 def smoothed_reverse_poiseuille(box: Box, magnitude: float, deviation: float) -> Accelerating:
-    r"""The smoothed force of reverse Poiseuille flow in closed form: along x, opposite in the lower and the upper half.
+    """The smoothed force of reverse Poiseuille flow in a box of any place and height, in closed form.
 
-    .. math:: g_x = g \left[ \operatorname{erf}(s) + \operatorname{erf}(s - 2 a) - \operatorname{erf}(s - a) \right],
-              \qquad s = \frac{y - y_0}{\sqrt 2 \sigma_u}, \quad a = \frac{L_y}{2 \sqrt 2 \sigma_u}
-
-    Before smoothing the force is g in the lower half and -g in the upper one, as in LagrangeBench's data. Positions are
-    wrapped first. Source: the authors' code, which has it for a box of height 2.
+    Before smoothing the force is along x, g in the lower half and -g in the upper one, as in LagrangeBench's data; see
+    `cconv.forces.ReversePoiseuilleForce.smoothed`.
 
     Args:
         box: Domain, periodic along the second axis, much longer there than the deviation.
@@ -135,14 +133,11 @@ def smoothed_reverse_poiseuille(box: Box, magnitude: float, deviation: float) ->
             f"`deviation` must be positive and at most a tenth of the box along its second axis ({box.lengths[1]:g}), "
             f"got {deviation:g}."
         )
-    lowest, half, scale = box.lower[1], box.lengths[1] / 2, math.sqrt(2) * deviation
+    force = ReversePoiseuilleForce(magnitude, box.lengths[1]).smoothed(deviation)
+    lower = torch.tensor(box.lower)
 
     def mean(positions: Tensor) -> Tensor:
         check_shape("positions", positions.shape, ("particles", box.dim))
-        height = box.wrap(positions)[:, 1] - lowest
-        first, second, third = (torch.erf((height - place) / scale) for place in (0.0, half, 2 * half))
-        accelerations = torch.zeros_like(positions)
-        accelerations[:, 0] = magnitude * (first - second + third)
-        return accelerations
+        return force(positions - lower.to(positions))
 
     return mean

@@ -64,7 +64,7 @@ class Asked:
         scene: Scene of the frames.
         stride: Frames from one that all metrics look at to the next; squared errors are of every frame.
         most_sinkhorn: Largest number of frames with a Sinkhorn divergence.
-        correctors: What corrects each frame before the next is asked for, in order.
+        correctors: What corrects each frame before the next is asked for, in order; None for what belongs to the model.
     """
 
     begun: Trajectory
@@ -73,7 +73,7 @@ class Asked:
     scene: Scene
     stride: int = STRIDE
     most_sinkhorn: int = MOST_SINKHORN
-    correctors: Sequence[Corrector] = ()
+    correctors: Sequence[Corrector] | None = None
 
     @property
     def start(self) -> Window:
@@ -87,7 +87,7 @@ def asked_rollout(
     scene: Scene,
     start: int = 0,
     frames: int | None = None,
-    correctors: Sequence[Corrector] = (),
+    correctors: Sequence[Corrector] | None = None,
 ) -> Asked:
     """A rollout from a frame of a stored trajectory on.
 
@@ -97,7 +97,7 @@ def asked_rollout(
         scene: Its scene.
         start: First frame of the window that the rollout begins with.
         frames: Number of frames to predict; None for all that are stored after the window.
-        correctors: What corrects each frame.
+        correctors: What corrects each frame; None for what belongs to the model.
 
     Raises:
         DataError: If the trajectory does not have all these frames.

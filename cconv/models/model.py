@@ -1,9 +1,10 @@
 """A model: a task, a network that predicts its target, and the standardisation of features and target."""
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from cconv.data.trajectory import Frame, Scene
 from cconv.data.window import Window
 from cconv.errors import ConfigError, ShapeError, shown
+from cconv.models.relaxation import Relaxation
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
 from cconv.neighbors import radius_graph
 from cconv.networks import NetworkTable
@@ -24,7 +26,7 @@ from cconv.tasks import TASKS, task_named
 from cconv.tasks.features import CONSTANT, WALLS, Inputs
 from cconv.tasks.samples import Sample
 from cconv.tasks.task import StepTask, Task, as_step
-from cconv.validation import Length, StrictModel, Whole
+from cconv.validation import Length, Real, StrictModel, Whole, validated
 
 MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
 
@@ -38,6 +40,8 @@ class ModelConfig(StrictModel):
     features of the task that are inputs of the model.
     `predictor` is the model whose step the network corrects, if there is one.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
+    `relaxation` is what rollouts of a step apply after every frame. `force_travel` is that of a step task to which the
+    integrator adds the external force, in particle spacings.
     """
 
     task: str
@@ -52,6 +56,8 @@ class ModelConfig(StrictModel):
     wall_vectors: Whole = Field(ge=0, le=1)
     network: NetworkTable
     predictor: "ModelConfig | None" = None
+    relaxation: Relaxation | None = None
+    force_travel: Annotated[Real, Field(ge=0, le=1e6)] | None = None
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -64,6 +70,9 @@ class ModelConfig(StrictModel):
             raise ValueError(f"a convolution of the walls needs the feature {WALLS!r}")
         if self.wall_scalars and self.wall_vectors:
             raise ValueError("wall points carry a scalar or a vector, not both")
+        for name in ("relaxation", "force_travel"):
+            if getattr(self, name) is not None and not issubclass(TASKS[self.task], StepTask):
+                raise ValueError(f"`{name}` is for steps, and {self.task!r} is a field of one frame")
         return self
 
     @model_validator(mode="after")
@@ -80,7 +89,7 @@ class ModelConfig(StrictModel):
     @property
     def asked(self) -> Task:
         """Task of the model."""
-        return task_named(self.task, self.kernel, self.relative_smoothing_length, self.history)
+        return task_named(self.task, self.kernel, self.relative_smoothing_length, self.history, self.force_travel)
 
     @property
     def fluid_features(self) -> tuple[str, ...]:
@@ -155,6 +164,17 @@ class Model(nn.Module):
         for name, values in (("feature", features), ("target", targets)):
             self.register_buffer(f"{name}_mean", values.mean.float())
             self.register_buffer(f"{name}_scale", values.scale.float())
+
+    def relaxed_by(self, relaxation: Relaxation | None) -> "Model":
+        """The same model, which shares its weights, with another relaxation of its rollouts.
+
+        Raises:
+            ConfigError: If the model is of a field.
+        """
+        settings = self.config.model_dump() | {"relaxation": relaxation}
+        model = copy(self)
+        model.config = validated(ModelConfig, settings, "relaxation")
+        return model
 
     @property
     def num_parameters(self) -> int:
@@ -290,6 +310,7 @@ def build_model(
         particle_spacing=scene.particle_spacing,
         frame_dt=scene.frame_dt,
         history=task.history,
+        force_travel=task.force_travel if isinstance(task, StepTask) else None,
         features=tuple(name for name in task.features if name in names),
         wall_scalars=walls.scalars,
         wall_vectors=walls.vectors,

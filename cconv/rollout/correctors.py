@@ -1,12 +1,13 @@
 """Correctors: what changes a frame after every step of a rollout, before the model is asked about it."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
+from cconv.models.model import Model
 from cconv.sph.relaxation import check_relaxation, relax
 
 
@@ -27,6 +28,12 @@ class Corrector(Protocol):
         Raises:
             SimulationError: If the frame cannot be corrected, which ends the rollout.
         """
+
+
+def correctors_of(model: Any) -> tuple[Corrector, ...]:
+    """Correctors that belong to a model: the relaxation of a saved one, if it has one; none for anything else."""
+    settings = model.config.relaxation if isinstance(model, Model) else None
+    return () if settings is None else (SPHRelaxation(settings.alpha, settings.beta, settings.loops),)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 from cconv.errors import CConvError, SimulationError
-from cconv.rollout.correctors import Corrector
+from cconv.rollout.correctors import Corrector, correctors_of
 from cconv.tasks.integrators import Integrator
 from cconv.tasks.task import as_step
 
@@ -40,7 +40,9 @@ class Diverged(CConvError):
         self.frame, self.reason = frame, reason
 
 
-def rollout(model: StepModel, start: Window, scene: Scene, *, correctors: Sequence[Corrector] = ()) -> Iterator[Window]:
+def rollout(
+    model: StepModel, start: Window, scene: Scene, *, correctors: Sequence[Corrector] | None = None
+) -> Iterator[Window]:
     """Windows after a start, a frame later each, for as long as they are asked for.
 
     Args:
@@ -48,13 +50,14 @@ def rollout(model: StepModel, start: Window, scene: Scene, *, correctors: Sequen
         start: The window to begin with, at least as long as the model's history.
         scene: Its scene.
         correctors: What corrects every frame, one after another, before the model is asked about it, e.g.
-            `cconv.rollout.correctors.SPHRelaxation`.
+            `cconv.rollout.correctors.SPHRelaxation`; None takes those that belong to the model.
 
     Raises:
         ConfigError: If the model predicts a field.
         Diverged: If the next frame would not be a state of particles any more.
     """
-    return advance(model.predict_frame, as_step(model.task).integrator, start, scene, correctors=correctors)
+    own = correctors_of(model) if correctors is None else correctors
+    return advance(model.predict_frame, as_step(model.task).integrator, start, scene, correctors=own)
 
 
 def advance(

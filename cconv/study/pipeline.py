@@ -12,7 +12,7 @@ from cconv.data.plausibility import dataset_findings
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
-from cconv.study.declared.search_space import check_baseline_affordable, longest_history
+from cconv.study.declared.search_space import check_baseline_affordable, longest_history, may_add_force
 from cconv.study.declared.stage import Stage, Trials, readers_of
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.records.environment import describe_environment
@@ -37,6 +37,7 @@ from cconv.study.running.serial_pool import SerialPool
 from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
 from cconv.study.studies import recorded_space, recorded_study
+from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import WALLS
 from cconv.validation import check_setting
 
@@ -154,6 +155,8 @@ def _session(
     dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
     task = study_task(study, dataset.scene, longest_history(space, study))
     check_test_split(study, dataset, task)
+    if may_add_force(space, study):
+        force_to_add(dataset.scene)
     problem = with_predictor(load_problem(study, dataset, task, progress), study, run.path / PREDICTOR, progress)
     for name in problem.task.optional:
         if name not in problem.present_features or (name == WALLS and not dataset.scene.has_boundary):

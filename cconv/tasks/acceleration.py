@@ -52,7 +52,7 @@ class Acceleration(StepTask):
     )
     optional = (DENSITY, PRESSURE_SOURCE, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
     checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
-    integrator = SemiImplicitEuler()
+    moved_by = SemiImplicitEuler()
 
     def unit(self, units: Units) -> float:
         """A particle spacing per frame, squared."""

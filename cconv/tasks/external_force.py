@@ -7,6 +7,8 @@ from torch import Tensor
 from cconv.data.smoothed_force import Accelerating, evaluated
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
+from cconv.errors import ConfigError
+from cconv.forces import Force
 from cconv.tasks.integrators import Integrator
 
 
@@ -44,3 +46,46 @@ class WithExternalForce:
     def _acceleration(self, window: Window, scene: Scene) -> Tensor:
         """Acceleration by the force at the present (M, D), length per frame squared."""
         return scene.frame_dt**2 * evaluated(self.force, window.present[window.is_fluid].double())
+
+
+@dataclass(frozen=True)
+class WithForceOfScene:
+    """Adds the external force of the scene, smoothed over the distance that particles travel in a frame.
+
+    Attributes:
+        integrator: Moves particles by the whole acceleration.
+        travel: Standard deviation of the displacements of a frame along an axis, in particle spacings.
+    """
+
+    integrator: Integrator
+    travel: float
+
+    def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
+        """The window a frame later; arguments as of `Integrator.advance`.
+
+        Raises:
+            ConfigError: If the scene has no force.
+        """
+        return self._of_scene(scene).advance(window, prediction, scene)
+
+    def target(self, window: Window, scene: Scene) -> Tensor:
+        """The answer (M, D) that leads to the first frame of the window's future, float64."""
+        return self._of_scene(scene).target(window, scene)
+
+    def _of_scene(self, scene: Scene) -> WithExternalForce:
+        force = force_to_add(scene).smoothed(self.travel * scene.particle_spacing)
+        return WithExternalForce(self.integrator, force)
+
+
+def force_to_add(scene: Scene) -> Force:
+    """External force of a scene, for an integrator to add.
+
+    Raises:
+        ConfigError: If the scene has none, or it is not known.
+    """
+    if scene.force is None:
+        raise ConfigError(
+            f"scene {scene.name!r}: there is no external force, and an integrator is to add it; give the force of the "
+            "data, or leave it to the network."
+        )
+    return scene.force

@@ -119,7 +119,7 @@ class WindowSamples(Sequence[StepSample]):
         return self.windows[index].ending(self.task.history)
 
     def of_task(self, task: StepTask) -> "WindowSamples":
-        """Samples of the same presents of another task, whose answers depend on as many frames or fewer."""
+        """Samples of the same presents for another task, whose history is no longer."""
         return WindowSamples(self.windows, self.scene, task)
 
     @cached_property

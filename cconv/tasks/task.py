@@ -14,6 +14,7 @@ from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.kernels import AbstractKernel, kernel_named
+from cconv.tasks.external_force import WithForceOfScene
 from cconv.tasks.features import (
     CONSTANT,
     DENSITY,
@@ -157,16 +158,25 @@ class StepTask(Task):
     other during a frame that is many solver steps long.
 
     Attributes:
-        integrator: Turns answers into the next frame, and the next frame into the answer that leads to it.
+        moved_by: Turns whole accelerations into the next frame.
+        force_travel: Standard deviation of the displacements of a frame along an axis, in particle spacings, where the
+            integrator adds the external force of the scene, smoothed over so much; None where networks know the force
+            or learn it.
         predictor: Model of a step that answers first; None without one.
     """
 
-    integrator: ClassVar[Integrator]
+    moved_by: ClassVar[Integrator]
     objective = "rollout_mse"
     histories = (2, 20)
 
     history: int = 6
+    force_travel: float | None = None
     predictor: Predictor | None = None
+
+    @property
+    def integrator(self) -> Integrator:
+        """Turns answers into the next frame, and the next frame into the answer that leads to it."""
+        return self.moved_by if self.force_travel is None else WithForceOfScene(self.moved_by, self.force_travel)
 
     def correcting(self, predictor: Predictor) -> "StepTask":
         """The task of correcting the step of a predictor.
@@ -181,14 +191,18 @@ class StepTask(Task):
         """Check that a model of some task can answer before one of this task does.
 
         Raises:
-            ConfigError: If it is another task, or depends on more frames.
+            ConfigError: If it is another task, depends on more frames, or leaves another force to its integrator.
         """
-        if asked.name != self.name:
+        if not isinstance(asked, StepTask) or asked.name != self.name:
             raise ConfigError(f"the predictor must be a model of the task {self.name!r}, and is one of {asked.name!r}")
         if asked.history > self.history:
             raise ConfigError(
                 f"`history` must be at least {asked.history}, the predictor's, got {self.history}; raise it, or fit "
                 "the predictor with a shorter one"
+            )
+        if asked.force_travel != self.force_travel:
+            raise ConfigError(
+                "the external force must be added by the integrator of both predictor and network, or by none"
             )
 
     def target(self, window: Window, scene: Scene) -> Float[Tensor, "M C"]:

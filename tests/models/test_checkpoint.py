@@ -2,16 +2,32 @@ import itertools
 import json
 import os
 import sys
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from systems import configured, problem
+from systems import (
+    configured,
+    model_of,
+    observed_and_sample,
+    periodic_frame,
+    periodic_scene,
+    problem,
+    window_of,
+)
 
 from cconv import load_model
 from cconv.errors import ConfigError
+from cconv.forces import ConstantForce
 from cconv.models.checkpoint import read_card, save_model
+from cconv.models.model import build_model
+from cconv.models.relaxation import Relaxation
+from cconv.rollout.rollout import rollout
+from cconv.tasks import task_named
+from cconv.tasks.samples import make_step_sample
 
 
 @pytest.fixture
@@ -27,6 +43,57 @@ def test_round_trip_predicts_the_same(saved):
     inputs = given.valid_samples[0].inputs
     assert torch.equal(load_model(folder).predict(inputs), model.predict(inputs))
     assert read_card(folder) == {"valid_error": 0.5}
+
+
+def test_a_checkpoint_from_before_relaxations_has_none(saved):
+    _, _, folder = saved
+    config = json.loads((folder / "config.json").read_text())
+    del config["relaxation"]
+    (folder / "config.json").write_text(json.dumps(config))
+    assert load_model(folder).config.relaxation is None
+
+
+def test_a_relaxation_is_kept_and_only_models_of_steps_have_one(generator, saved, tmp_path):
+    observed, sample = observed_and_sample(periodic_frame(generator), periodic_scene(), "acceleration", generator)
+    model = model_of(configured(layers=1), periodic_scene(), "acceleration", [sample], generator)
+    relaxation = Relaxation(alpha=0.02, beta=0.3, loops=2)
+    save_model(model.relaxed_by(relaxation), tmp_path / "steps", {})
+    loaded = load_model(tmp_path / "steps")
+    assert loaded.config.relaxation == relaxation
+    assert model.config.relaxation is None
+    scene = periodic_scene()
+    assert torch.equal(loaded.predict_frame(observed, scene), model.predict_frame(observed, scene))
+    with pytest.raises(ConfigError, match="`relaxation` is for steps, and 'density_rate' is a field"):
+        saved[1].relaxed_by(relaxation)
+
+
+def test_the_force_that_the_integrator_adds_is_kept_with_how_far_it_is_smoothed(generator, tmp_path):
+    task, scene = (
+        task_named("acceleration", force_travel=0.3),
+        replace(periodic_scene(), force=ConstantForce((1.0, 0.0))),
+    )
+    window = window_of(periodic_frame(generator), generator)
+    network = configured(layers=1).network
+    model = build_model(network, task, task.features, scene, [make_step_sample(window, scene, task)], generator)
+    save_model(model, tmp_path / "steps", {})
+    loaded = load_model(tmp_path / "steps")
+    assert loaded.task == model.task == task
+    (here,), (there,) = (islice(rollout(each, window, scene), 1) for each in (model, loaded))
+    assert torch.equal(here.present, there.present)
+    with pytest.raises(ConfigError, match="there is no external force"):
+        next(rollout(loaded, window, periodic_scene()))
+
+
+@pytest.mark.parametrize(
+    ("stored", "key"),
+    [({"alpha": -1.0}, "alpha"), ({"alpha": 0.02, "loops": 0}, "loops"), ({"alpha": 0.02, "gamma": 1.0}, "gamma")],
+)
+def test_a_relaxation_that_cannot_be_is_one_line(stored, key, saved):
+    _, _, folder = saved
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"relaxation": stored}))
+    with pytest.raises(ConfigError, match=rf"config\.json: .*relaxation\.{key}"):
+        load_model(folder)
 
 
 def test_saving_again_replaces_and_leaves_nothing_behind(saved):

@@ -9,6 +9,7 @@ from systems import configured, model_of, observed_and_sample, periodic_frame, p
 
 import cconv
 from cconv.errors import ConfigError
+from cconv.models.relaxation import Relaxation
 from cconv.rollout.correctors import SPHRelaxation
 from cconv.rollout.rollout import Diverged, advance
 from cconv.sph import relax
@@ -84,6 +85,20 @@ def test_a_model_is_asked_about_corrected_frames(generator):
         after = EULER.advance(window, model.predict_frame(window, scene), scene)
         window = RELAXATION(window, after, scene)
         torch.testing.assert_close(each.present, window.present, atol=1e-6, rtol=0)
+
+
+def test_the_relaxation_of_a_saved_model_belongs_to_its_rollouts(generator):
+    scene = periodic_scene()
+    observed, sample = observed_and_sample(periodic_frame(generator), scene, "acceleration", generator)
+    model = model_of(configured(layers=1), scene, "acceleration", [sample], generator)
+    own = model.relaxed_by(Relaxation(alpha=0.02, beta=0.3, loops=2))
+
+    def last(model, **given):
+        return list(islice(cconv.rollout(model, observed, scene, **given), 3))[-1].present
+
+    assert torch.equal(last(own), last(model, correctors=[RELAXATION]))
+    assert torch.equal(last(own, correctors=[]), last(model))
+    assert not torch.equal(last(own), last(model))
 
 
 def test_replayed_targets_are_the_stored_frames_without_correctors(generator):

@@ -74,9 +74,21 @@ def test_the_report_speaks_of_rollouts(run):
 def test_the_recommended_model_of_the_run_is_rolled_out_and_evaluated(run, cconv):
     code, printed, _ = cconv("rollout", run.path, "--frames", 6, "--json")
     assert code in (0, 1)  # a model of six updates may diverge
-    chosen = str(run.path / run.summary().chosen.checkpoint)
+    chosen = str(run.path / run.summary().offered_checkpoint)
     assert json.loads(printed)["checkpoint"] == chosen
     assert json.loads(cconv("evaluate", run.path, "--json")[1])["checkpoint"] == chosen
+
+
+def test_the_relaxation_was_chosen_by_validation_rollouts_and_is_applied(run, cconv):
+    summary = run.summary()
+    relaxed, own = summary.relaxed, summary.recommended.id
+    chosen = relaxed.models[own].tried[relaxed.chosen[own]]
+    assert set(relaxed.models) == {own, summary.selection.best}
+    assert relaxed.models[own].tried[0].quality == 1
+    applied = json.loads(cconv("rollout", run.path, "--frames", 3, "--json")[1])["relaxation"]
+    assert applied == (chosen.model_dump(include={"alpha", "beta", "loops"}) if relaxed.checkpoint else None)
+    assert json.loads(cconv("rollout", run.path, "--frames", 3, "--no-relax", "--json")[1])["relaxation"] is None
+    assert '<h2 id="relaxation">' in (run.path / "report.html").read_text()
 
 
 def test_every_training_of_a_finalist_is_rolled_out_over_the_whole_test_trajectory(run):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import Boundary, Scene, Trajectory
 from cconv.data.window import Window, window_at
 from cconv.domain import Box
-from cconv.forces import Force
+from cconv.forces import Force, Smoothed
 
 SHAKEN = 0.05  # standard deviation of the shifts along each axis, particle spacings
 SQUEEZED, SQUEEZED_WITHIN = 0.1, 4.0  # share that lengths lose at the centre of a ball, its radius in spacings
@@ -71,7 +72,14 @@ class MappedForce(Force):
 
     def __call__(self, positions: Tensor) -> Tensor:
         """Accelerations (N, D) at positions (N, D)."""
-        return self.mapping.of_vectors(self.force(self.mapping.inverse(positions))).to(positions.dtype)
+        return self._mapped(self.force, positions)
+
+    def smoothed(self, deviation: float) -> Smoothed:
+        """The smoothed force before the mapping, mapped; see `Force.smoothed`."""
+        return partial(self._mapped, self.force.smoothed(deviation / self.mapping.factor))
+
+    def _mapped(self, force: Smoothed, positions: Tensor) -> Tensor:
+        return self.mapping.of_vectors(force(self.mapping.inverse(positions))).to(positions.dtype)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from cconv.report.sections.importance import ImportanceSection
 from cconv.report.sections.learned import LearnedSection
 from cconv.report.sections.provenance import ProvenanceSection
 from cconv.report.sections.refined import RefinedSection
+from cconv.report.sections.relaxation import RelaxationSection
 from cconv.report.sections.rollouts import RolloutsSection
 from cconv.report.sections.rungs import RungsSection
 from cconv.report.sections.same_budget import SameBudgetSection
@@ -34,6 +35,7 @@ SECTIONS: tuple[Section, ...] = (
     BudgetSection(),
     StabilitySection(),
     RolloutsSection(),
+    RelaxationSection(),
     CostSection(),
     SearchSection(),
     SameBudgetSection(),

@@ -21,6 +21,8 @@ MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns
 STILL = {"noise": 0.0, "pushforward": 0, "unroll": 1}  # settings of a training, with which no particle is moved
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
 HISTORY, WITH_PREDICTOR = "task.history", "task.with_predictor"
+EXTERNAL_FORCE = "task.external_force"
+BY_NETWORK, BY_INTEGRATOR = "network", "integrator"  # who knows of the external force
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
 _OF_NETWORKS = dict.fromkeys(name for settings in ARCHITECTURES.values() for name in settings.model_fields)
@@ -28,6 +30,7 @@ HYPERPARAMETERS = (
     *(f"{NETWORK}.{name}" for name in _OF_NETWORKS),
     HISTORY,
     WITH_PREDICTOR,
+    EXTERNAL_FORCE,
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
     *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
@@ -43,6 +46,7 @@ class TaskConfig(StrictModel):
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
     takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
     `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
+    `external_force` says whether the network learns it, or the integrator adds it and the network learns the rest.
     """
 
     name: Annotated[str, OneOf(tuple(TASKS))]
@@ -51,6 +55,7 @@ class TaskConfig(StrictModel):
     features: tuple[str, ...] | None = Field(None, max_length=100)
     history: Whole | None = None
     horizon: Horizon | None = None
+    external_force: Literal["network", "integrator"] = "network"
 
     @field_validator("kernel")
     @classmethod
@@ -131,6 +136,7 @@ class Configuration(NamedTuple):
         history: Frames that an answer depends on, the present one among them.
         network: Network settings.
         training: Training settings.
+        external_force: "network" if the network learns it, "integrator" if the integrator of a step adds it.
         with_predictor: Whether the network corrects the step of the study's predictor, if it has one.
     """
 
@@ -138,6 +144,7 @@ class Configuration(NamedTuple):
     history: int
     network: NetworkSettings
     training: TrainingConfig
+    external_force: str = BY_NETWORK
     with_predictor: bool = False
 
 
@@ -177,6 +184,7 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
         _history(parameters, defaults),
         _possible(settings, NETWORK, kept | drawn),
         _possible(TrainingConfig, TRAINING, defaults.training.model_dump() | below(TRAINING, parameters)),
+        _external_force(parameters, defaults),
         _with_predictor(parameters, defaults),
     )
 
@@ -194,6 +202,8 @@ def check_asked(configuration: Configuration, task: str) -> None:
         TASKS[task].check_history(configuration.history)
     except ConfigError as error:
         raise ConfigError(f"not possible ({HISTORY}: {error})") from error
+    if configuration.external_force == BY_INTEGRATOR and not issubclass(TASKS[task], StepTask):
+        raise ConfigError(f"not possible ({EXTERNAL_FORCE}: is for steps, and {task!r} is a field of one frame)")
     for name, value in configuration.training.moving.items():
         if not issubclass(TASKS[task], StepTask):
             allowed = f"must be {STILL[name]:g} for the field {task!r}"
@@ -235,6 +245,14 @@ def _history(parameters: Mapping[str, Value], defaults: Configuration) -> int:
     if not isinstance(history, int) or isinstance(history, bool):
         raise ConfigError(f"not possible ({HISTORY}: must be a whole number, got {shown(history)})")
     return history
+
+
+def _external_force(parameters: Mapping[str, Value], defaults: Configuration) -> str:
+    """Who knows of the external force: what is drawn, or the study's own."""
+    known = parameters.get(EXTERNAL_FORCE, defaults.external_force)
+    if known not in (BY_NETWORK, BY_INTEGRATOR):
+        raise ConfigError(f"not possible ({EXTERNAL_FORCE}: must be {BY_NETWORK!r} or {BY_INTEGRATOR!r})")
+    return str(known)
 
 
 def _with_predictor(parameters: Mapping[str, Value], defaults: Configuration) -> bool:

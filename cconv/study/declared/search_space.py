@@ -11,7 +11,9 @@ from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import (
     ARCHITECTURE,
+    BY_INTEGRATOR,
     DEFAULTS,
+    EXTERNAL_FORCE,
     HISTORY,
     HYPERPARAMETERS,
     NETWORK,
@@ -70,6 +72,13 @@ def longest_history(space: SearchSpace, study: StudyConfig) -> int:
     named = [parameters.get(HISTORY) for _, parameters in included(study.stages)]
     histories = [study.task.usual_history, *drawn, *named]
     return max(history for history in histories if isinstance(history, int))
+
+
+def may_add_force(space: SearchSpace, study: StudyConfig) -> bool:
+    """Tell whether the integrator adds the external force in a configuration of a study."""
+    searched = space.parameters[EXTERNAL_FORCE].extremes if EXTERNAL_FORCE in space.parameters else []
+    named = [parameters.get(EXTERNAL_FORCE) for _, parameters in included(study.stages)]
+    return BY_INTEGRATOR in (study.task.external_force, *searched, *named)
 
 
 def _check_conditions_on_architectures(space: SearchSpace, source: Path | str) -> None:

@@ -30,6 +30,7 @@ class Stage(StrictModel, ABC):
         uses: Kinds of stages whose records it can read.
         needs_records: Whether it can do nothing without a stage to read.
         space_kinds: Kinds of stages whose narrowed space it can search.
+        only_for_steps: Whether it makes sense for tasks of steps alone.
         is_single: Whether a study has at most one stage of the kind, because the summary has one place for its result.
         reads: Names of the stages whose records it uses; None means every earlier one of a kind that it can use.
         kind: Its kind, by which the study file chooses the class.
@@ -38,6 +39,7 @@ class Stage(StrictModel, ABC):
     uses: ClassVar[tuple[str, ...]] = ()
     needs_records: ClassVar[bool] = False
     space_kinds: ClassVar[tuple[str, ...]] = ()
+    only_for_steps: ClassVar[bool] = False
     is_single: ClassVar[bool] = False
     reads: tuple[Name, ...] | None = None
     kind: str

@@ -11,6 +11,7 @@ from cconv.errors import ConfigError
 from cconv.networks import ConvNetSettings, NetworkTable
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import (
+    EXTERNAL_FORCE,
     HISTORY,
     WITH_PREDICTOR,
     Configuration,
@@ -197,6 +198,13 @@ class StudyConfig(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _stages_fit_the_task(self) -> "StudyConfig":
+        for name, stage in self.stages.items():
+            if stage.only_for_steps and not issubclass(TASKS[self.task.name], StepTask):
+                raise ValueError(f"stage `{name}` is for steps, and {self.task.name!r} is a field; remove it")
+        return self
+
+    @model_validator(mode="after")
     def _included_are_possible(self) -> "StudyConfig":
         for finalist, parameters in included(self.stages):
             try:
@@ -209,7 +217,7 @@ class StudyConfig(StrictModel):
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
         task, corrects = self.task, self.predictor is not None
-        return Configuration(task.taken, task.usual_history, self.network, self.training, corrects)
+        return Configuration(task.taken, task.usual_history, self.network, self.training, task.external_force, corrects)
 
     def configured(self, parameters: Mapping[str, Value]) -> Configuration:
         """What a trial has for which these hyperparameters are drawn.
@@ -233,6 +241,8 @@ class StudyConfig(StrictModel):
                 f"not possible ({HISTORY}: must be at least {self.task.usual_history}, that of the predictor, got "
                 f"{configuration.history})"
             )
+        if configuration.external_force != self.task.external_force:
+            raise ConfigError(f"not possible ({EXTERNAL_FORCE}: must be that of the predictor)")
 
     @property
     def rungs(self) -> list[int]:

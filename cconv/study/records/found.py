@@ -6,8 +6,10 @@ too few values for one.
 
 from typing import Literal, NamedTuple
 
+from pydantic import Field, model_validator
+
 from cconv.study.records.forms import Count, NonNegative
-from cconv.validation import Flag, Id, Name, Real, StrictModel, Value
+from cconv.validation import Flag, Id, InnerPath, Length, Name, Real, StrictModel, Value
 
 Interval = tuple[Real, Real]
 
@@ -281,8 +283,75 @@ class Convergence(StrictModel):
     still_falling: Flag
 
 
+class TriedRelaxation(StrictModel):
+    """A relaxation that was tried on validation rollouts; one without loops is none.
+
+    Attributes:
+        alpha: Size of a shift.
+        beta: Viscosity relative to the pressure.
+        loops: Shifts in a frame, the cost.
+        quality: Geometric mean of the three measures ÷ those without relaxation; below 1 it makes rollouts better.
+        mse: Mean squared error of the positions.
+        sinkhorn: Sinkhorn divergence from the stored particles in the last frame.
+        density: Mean |ρ - 1| in the last frame.
+        diverged: Number of rollouts that did not reach their last frame.
+        reason: Why the first of these ended, or "".
+        seconds: Duration of the rollouts.
+    """
+
+    alpha: NonNegative
+    beta: NonNegative
+    loops: Count
+    quality: Length
+    mse: NonNegative
+    sinkhorn: NonNegative
+    density: NonNegative
+    diverged: Count
+    reason: str
+    seconds: NonNegative
+
+
+class RelaxedModel(StrictModel):
+    """The relaxations that were tried with a finalist, in order; the first is none.
+
+    Attributes:
+        checkpoint: Folder of its model, relative to the run folder.
+        frames: Frames of each rollout.
+        rollouts: Number of validation rollouts of each.
+        tried: What was tried.
+    """
+
+    checkpoint: InnerPath
+    frames: Count
+    rollouts: Count
+    tried: tuple[TriedRelaxation, ...] = Field(min_length=1)
+
+
+class Relaxed(StrictModel):
+    """Relaxations of the rollouts of finalists, chosen by validation rollouts.
+
+    Attributes:
+        models: What was tried, by finalist.
+        chosen: Number of the chosen one of these, by finalist; 0 is none.
+        checkpoint: Folder of the recommended model with its relaxation, relative to the run folder; None without one.
+    """
+
+    models: dict[Id, RelaxedModel]
+    chosen: dict[Id, Count]
+    checkpoint: InnerPath | None
+
+    @model_validator(mode="after")
+    def _the_chosen_were_tried(self) -> "Relaxed":
+        if self.chosen.keys() != self.models.keys():
+            raise ValueError("`chosen` must name the same finalists as `models`")
+        for name, number in self.chosen.items():
+            if number >= len(self.models[name].tried):
+                raise ValueError(f"`chosen.{name}` must be the number of a relaxation that was tried")
+        return self
+
+
 class Parts(StrictModel):
-    """Parts of the summary that come from the stages before the selection; a part without its stage is empty.
+    """Parts of the summary that come from other stages than the selection; a part without its stage is empty.
 
     Attributes:
         refined: Domain of each hyperparameter in the narrowed space and the reason, in words.
@@ -294,6 +363,7 @@ class Parts(StrictModel):
         partial_dependence: Dependence of the error on the strongest of them.
         ablation: Error after each change between the baseline and the best model.
         convergence: Errors with larger budgets, by finalist.
+        relaxed: Relaxations of the rollouts of the recommended model and of the most accurate one.
     """
 
     refined: dict[str, str] = {}
@@ -305,6 +375,7 @@ class Parts(StrictModel):
     partial_dependence: tuple[PartialDependence, ...] = ()
     ablation: Ablation | None = None
     convergence: dict[Id, Convergence] = {}
+    relaxed: Relaxed | None = None
 
     def found(self) -> dict:
         """Return the parts that were set by a stage, by name."""

@@ -473,3 +473,8 @@ class Summary(Parts, Selected):
     def chosen(self) -> FinalistEntry:
         """The recommended finalist."""
         return next(entry for entry in self.finalists if entry.id == self.recommended.id)
+
+    @property
+    def offered_checkpoint(self) -> str:
+        """Folder of the recommended model, with its relaxation if it has one, relative to the run folder."""
+        return (self.relaxed and self.relaxed.checkpoint) or self.chosen.checkpoint

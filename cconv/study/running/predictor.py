@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.model import Model
-from cconv.study.declared.configuration import Configuration, TrainingConfig
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.study_file import PredictorConfig, StudyConfig
 from cconv.study.running.problem import Problem, provenance
 
@@ -41,7 +41,7 @@ def with_predictor(
 def _fitted(problem: Problem, study: StudyConfig, asked: PredictorConfig, progress: Progress) -> Model:
     training = TrainingConfig(noise=asked.noise, loss=asked.loss)
     model = problem.build_model(
-        Configuration(study.task.taken, study.task.usual_history, asked.network, training), study.seeds.init
+        study.configuration._replace(network=asked.network, training=training, with_predictor=False), study.seeds.init
     )
     places = progress(range(len(problem.train_samples)), "fit the predictor")
     problem.solve_closed_form(model, training, places, asked.ridge, study.seeds.data)

@@ -9,17 +9,27 @@ import torch
 
 from cconv.data.dataset import Dataset, open_dataset
 from cconv.data.metadata import OVERRIDES
+from cconv.data.smoothed_force import travel_deviation
 from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.closed_form import solve_closed_form
 from cconv.models.model import Model, absent_features, build_model
-from cconv.study.declared.configuration import MOST_PUSHED, Configuration, TrainingConfig
+from cconv.study.declared.configuration import BY_INTEGRATOR, MOST_PUSHED, Configuration, TrainingConfig
 from cconv.study.declared.study_file import DataConfig, StudyConfig
 from cconv.tasks import task_named
+from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import features_in
-from cconv.tasks.samples import HORIZON, Sample, WindowSamples, iterate_samples, learned_samples, rolled_samples
+from cconv.tasks.samples import (
+    HORIZON,
+    Sample,
+    StepSample,
+    WindowSamples,
+    iterate_samples,
+    learned_samples,
+    rolled_samples,
+)
 from cconv.tasks.task import StepTask, Task, as_field, as_step
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
@@ -61,8 +71,15 @@ class Problem:
         return self._typical(self.task)
 
     def task_of(self, configuration: Configuration) -> Task:
-        """Task of the models of a configuration, with its history, after the predictor or without it."""
+        """Task of the models of a configuration: its history, the force that its integrator adds, its predictor.
+
+        Raises:
+            ConfigError: If there is no external force to add.
+        """
         task = replace(self.task, history=configuration.history)
+        if configuration.external_force == BY_INTEGRATOR:
+            force_to_add(self.scene)
+            task = replace(as_step(task), force_travel=self._travel)
         if self.predictor is None or not configuration.with_predictor:
             return task
         return as_step(task).correcting(self.predictor)
@@ -72,7 +89,7 @@ class Problem:
         return samples.spread if isinstance(samples, WindowSamples) else samples
 
     def _training_samples(self, task: Task) -> Sequence[Sample]:
-        """Training samples of models of a task with some history; those of each are made once."""
+        """Training samples of models of some task; those of each are made once."""
         if not isinstance(self.train_samples, WindowSamples):
             return self.train_samples
         if task not in self._of_task:
@@ -83,12 +100,19 @@ class Problem:
     def _of_task(self) -> dict[Task, WindowSamples]:
         return {}
 
+    @cached_property
+    def _travel(self) -> float:
+        """Standard deviation of displacements of a frame along an axis in training windows, in particle spacings."""
+        windows = [sample.window for sample in self.typical_samples if isinstance(sample, StepSample)]
+        moved = torch.cat([each.last_displacements(self.scene.box)[each.is_fluid] for each in windows])
+        return travel_deviation(moved.std(dim=0, correction=0).tolist()) / self.scene.particle_spacing
+
     def valid_error(self, model: Model, geometry: Callable | None = None) -> float:
         """Compute the error of a model on the validation split; without a cache all geometries are computed anew."""
         return self.objective.error(model, self.valid_samples, geometry)
 
     def examples(self, training: TrainingConfig, seed: int, task: Task) -> Examples:
-        """Make the examples of a training, with its noise and pushforward, of a model of a task of `task_of`.
+        """Make the examples of a training, with its noise and pushforward, of a model of some task, of `task_of`.
 
         Raises:
             ConfigError: If one of them is asked for where there are no windows.
@@ -227,7 +251,12 @@ def load_problem(
         dataset: Its data.
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
+
+    Raises:
+        ConfigError: If the integrator is to add an external force where there is none.
     """
+    if study.task.external_force == BY_INTEGRATOR:
+        force_to_add(dataset.scene)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
     return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
 

@@ -67,7 +67,7 @@ def run_trial(
     best = _best_so_far(folder)
     states = train(
         model,
-        problem.examples(training, trial.data_seed, problem.task_of(configuration)),
+        problem.examples(training, trial.data_seed, model.task),
         problem.valid_error,
         Optimization(**training.model_dump(include={field.name for field in fields(Optimization)})),
         data_seed=trial.data_seed,

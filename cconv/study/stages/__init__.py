@@ -15,6 +15,7 @@ from cconv.study.stages.initialization import InitializationStage
 from cconv.study.stages.random import RandomStage
 from cconv.study.stages.reference import ReferenceStage
 from cconv.study.stages.refine import RefineStage
+from cconv.study.stages.relax import RelaxStage
 from cconv.study.stages.select import SelectStage
 
 STAGES: tuple[type[Stage], ...] = (
@@ -30,4 +31,5 @@ STAGES: tuple[type[Stage], ...] = (
     AblationStage,
     ConvergeStage,
     SelectStage,
+    RelaxStage,
 )

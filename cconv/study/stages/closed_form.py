@@ -24,6 +24,7 @@ from cconv.networks import ARCHITECTURES
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import (
     ARCHITECTURE,
+    EXTERNAL_FORCE,
     HISTORY,
     NETWORK,
     OPTIONAL_FEATURES,
@@ -134,7 +135,14 @@ def _paths(settings: Mapping[str, Value]) -> dict[str, Value]:
 def _applies(settings: type[NetworkSettings]) -> set[str]:
     """List the paths of the hyperparameters that a single layer of an architecture has."""
     of_network = (f"{NETWORK}.{name}" for name in settings.linear_settings)
-    return {*of_network, HISTORY, *map(feature_path, OPTIONAL_FEATURES), f"{TRAINING}.noise", f"{TRAINING}.loss"}
+    return {
+        *of_network,
+        HISTORY,
+        EXTERNAL_FORCE,
+        *map(feature_path, OPTIONAL_FEATURES),
+        f"{TRAINING}.noise",
+        f"{TRAINING}.loss",
+    }
 
 
 def _extended(layers: Sequence[dict], choices: Sequence[Sequence[dict]]) -> list[dict]:

@@ -8,7 +8,7 @@ from cconv.networks import RadialNetSettings
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
-from cconv.study.declared.search_space import check_baseline_affordable, load_space, longest_history
+from cconv.study.declared.search_space import check_baseline_affordable, load_space, longest_history, may_add_force
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
 from cconv.study.studies import load_study
 
@@ -344,6 +344,33 @@ def test_the_longest_history_is_that_of_any_configuration(domain, own, longest, 
     assert longest_history(space, study) == longest
     assert study.configured({"task.history": 2}).history == 2
     assert study.configured({}).history == own
+
+
+FORCE = '[parameters.task.external_force]\ntype = "choice"\nvalues = {}\nbaseline = "network"\nreason = "r"\n'
+
+
+@pytest.mark.parametrize(
+    ("values", "own", "added"),
+    [
+        (["network", "integrator"], "network", True),
+        (["network"], "network", False),
+        (["network"], "integrator", True),
+    ],
+)
+def test_who_knows_of_the_external_force_is_a_hyperparameter_of_steps(values, own, added, space_file):
+    study = load_study(REPOSITORY / "experiments" / "rollout.toml", [f"task.external_force={own}"])
+    assert may_add_force(load_space(space_file(FORCE.format(values)), study), study) == added
+    assert study.configured({"task.external_force": "integrator"}).external_force == "integrator"
+    assert study.configured({}).external_force == own
+
+
+def test_the_external_force_is_known_to_the_network_or_the_integrator_of_a_step(space_file):
+    study = load_study(REPOSITORY / "experiments" / "rollout.toml")
+    with pytest.raises(ConfigError, match=r"task\.external_force: must be 'network' or 'integrator'"):
+        load_space(space_file(FORCE.format(["network", "solver"])), study)
+    field = load_study(REPOSITORY / "experiments" / "quick.toml")
+    with pytest.raises(ConfigError, match=r"task\.external_force: is for steps, and 'density_rate' is a field"):
+        load_space(space_file(FORCE.format(["network", "integrator"])), field)
 
 
 def test_layers_of_a_huge_space_are_drawn_without_listing_them():

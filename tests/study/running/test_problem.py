@@ -7,6 +7,8 @@ import pytest
 import torch
 from systems import configured, periodic_frame, periodic_scene, problem, window_of
 
+from cconv.errors import ConfigError
+from cconv.forces import ReversePoiseuilleForce
 from cconv.study.declared.configuration import DEFAULTS, TrainingConfig
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
@@ -68,7 +70,7 @@ def test_a_model_does_not_depend_on_the_longest_history_that_others_have(history
     assert all(torch.equal(value, known[name]) for name, value in models[0].state_dict().items())
     for training in (TrainingConfig(), TrainingConfig(noise=0.02)):
         drawn = [
-            each.examples(training, 1, each.task_of(of_history(history))).draw(2, 5, model)
+            each.examples(training, 1, model.task).draw(2, 5, model)
             for each, model in zip((long, short), models, strict=True)
         ]
         assert drawn[0].frame == drawn[1].frame
@@ -87,3 +89,52 @@ def test_a_network_is_given_the_accelerations_of_its_history(history, accelerati
     assert torch.equal(
         model.predict_frame(window, problem.scene), model.predict_frame(window.ending(history), problem.scene)
     )
+
+
+OPPOSITE = ReversePoiseuilleForce(400.0, 1.0)
+
+
+def falling(generator, force=OPPOSITE):
+    """A problem of steps whose scene has a strong force, by which its particles were not moved."""
+    scene = replace(periodic_scene(), force=force)
+    windows = [window_of(periodic_frame(generator), generator) for _ in range(3)]
+    samples = WindowSamples(windows, scene, task_named("acceleration"))
+    return Problem(scene=scene, task=samples.task, train_samples=samples, valid_samples=samples)
+
+
+def test_targets_are_standardised_after_the_force_was_taken_off(generator):
+    """What was not moved by the force has to be moved against it, so that targets spread more than before."""
+    given = falling(generator)
+    every = of_history(6)
+    plain, without = (given.build_model(every._replace(external_force=who), 0) for who in ("network", "integrator"))
+    spacing = given.scene.particle_spacing
+    force = OPPOSITE.smoothed(without.task.force_travel * spacing)
+    for sample, other in zip(given._typical(plain.task), given._typical(without.task), strict=True):
+        added = force(sample.window.present) * given.scene.frame_dt**2 / spacing
+        torch.testing.assert_close(sample.target - other.target, added, rtol=0, atol=1e-5)
+    assert without.target_scale.max() > 2 * plain.target_scale.max()
+    assert (plain.config.force_travel, without.config.force_travel is None) == (None, False)
+    drawn = given.examples(TrainingConfig(noise=0.01), 1, without.task).draw(0, 1, without)
+    assert drawn.task == without.task
+
+
+def test_the_travel_is_the_deviation_of_the_displacements_in_particle_spacings(generator):
+    given = falling(generator)
+    moved = torch.cat([each.last_displacements(given.scene.box) for each in given.train_samples.windows])
+    deviation = float((moved - moved.mean(dim=0)).square().mean().sqrt())
+    task = given.task_of(of_history(6)._replace(external_force="integrator"))
+    assert task.force_travel == pytest.approx(deviation / given.scene.particle_spacing)
+
+
+def test_a_rollout_of_the_model_adds_the_force_that_its_samples_do_not(generator):
+    """Errors of a model are those of its own integrator, also where the samples are of the study's task."""
+    given = falling(generator)
+    model = given.build_model(of_history(6)._replace(external_force="integrator"), 0)
+    (first, *_) = given.valid_samples
+    other = given.valid_samples.of_task(model.task)[0]
+    assert given.objective.error(model, [first]) == given.objective.error(model, [other])
+
+
+def test_no_integrator_adds_a_force_that_is_not_there(generator):
+    with pytest.raises(ConfigError, match="there is no external force"):
+        falling(generator, None).build_model(of_history(6)._replace(external_force="integrator"), 0)
