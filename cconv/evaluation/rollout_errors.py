@@ -1,6 +1,6 @@
 """Errors of rollouts that begin at samples, against the frames that are stored after them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.trajectory import Scene
-from cconv.data.window import Window
+from cconv.data.window import Window, join_windows, joinable
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.evaluation.rollout_metrics import squared_errors
 from cconv.models.model import Model
-from cconv.rollout.rollout import Diverged, advance
+from cconv.rollout.rollout import Diverged, begun, followed
 from cconv.tasks.samples import Sample, StepSample
 
 
@@ -46,7 +46,7 @@ def worst_error(box: Box) -> float:
 
 def rollouts_of(model: Model, samples: Iterable[Sample]) -> list[RolloutErrors]:
     """Roll a model out from samples of its task, for as many frames as are known after each."""
-    return [rollout_errors(model.predict_frame, start) for start in starts(samples)]
+    return joined_errors(model.predict_frame, starts(samples))
 
 
 def constant_rollouts(answer: Float[Tensor, " C"], samples: Iterable[Sample]) -> list[RolloutErrors]:
@@ -55,7 +55,7 @@ def constant_rollouts(answer: Float[Tensor, " C"], samples: Iterable[Sample]) ->
     def predict(window: Window, scene: Scene) -> Tensor:
         return answer.expand(int(window.is_fluid.sum()), -1)
 
-    return [rollout_errors(predict, start) for start in starts(samples)]
+    return joined_errors(predict, starts(samples))
 
 
 def starts(samples: Iterable[Sample]) -> list[StepSample]:
@@ -72,15 +72,52 @@ def starts(samples: Iterable[Sample]) -> list[StepSample]:
 
 def rollout_errors(predict: Callable[[Window, Scene], Tensor], start: StepSample) -> RolloutErrors:
     """Errors of one rollout in each frame that is known after its start."""
-    scene, future = start.scene, start.window.future
+    (errors,) = _errors_of_group(predict, [start])
+    return errors
+
+
+def joined_errors(predict: Callable[[Window, Scene], Tensor], begun_at: Sequence[StepSample]) -> list[RolloutErrors]:
+    """Errors of several rollouts, which advance together where their windows can be joined.
+
+    A rollout that diverges leaves the others, and its further frames count as the worst.
+
+    Args:
+        predict: One window, or several joined, and their scene to the answer (M, D) for each of the M fluid particles.
+        begun_at: Starts of the rollouts, of one task, in any scenes.
+    """
+    found: dict[int, RolloutErrors] = {}
+    scenes = {id(start.scene): start.scene for start in begun_at}
+    for scene in scenes.values():
+        numbers = [number for number, start in enumerate(begun_at) if start.scene is scene]
+        for group in joinable([begun_at[number].window for number in numbers]):
+            together = [numbers[place] for place in group]
+            errors = _errors_of_group(predict, [begun_at[number] for number in together])
+            found |= dict(zip(together, errors, strict=True))
+    return [found[number] for number in range(len(begun_at))]
+
+
+def _errors_of_group(predict: Callable[[Window, Scene], Tensor], group: Sequence[StepSample]) -> list[RolloutErrors]:
+    """Errors of rollouts that begin with windows that can be joined."""
+    scene, integrator = group[0].scene, group[0].task.integrator
     worst = worst_error(scene.box)
-    errors = np.full(len(future), worst)
-    path = advance(predict, start.task.integrator, start.window, scene)
-    diverged = None
-    try:
-        for place, window in zip(range(len(future)), path, strict=False):
-            found = float(squared_errors(window.present[None], future[place][None], scene.box))
-            errors[place] = min(found, worst)
-    except Diverged as error:
-        diverged = error.reason
-    return RolloutErrors(trajectory=start.trajectory, frame=start.window.frame, errors=errors, diverged=diverged)
+    errors = np.full((len(group), len(group[0].window.future)), worst)
+    diverged: list[str | None] = [None] * len(group)
+    window, going = begun(join_windows([start.window for start in group])), list(range(len(group)))
+    for frame in range(errors.shape[1]):
+        try:
+            window, ends = followed(predict, integrator, window, scene)
+        except Diverged as error:  # of a solver in the place of a model
+            ends = [error] * len(going)
+        for number, end in zip(going, ends, strict=True):
+            diverged[number] = None if end is None else end.reason
+        going = [number for number in going if diverged[number] is None]
+        if not going:
+            break
+        window = window.only([end is None for end in ends])
+        for number, part in zip(going, window.separated(), strict=True):
+            stored = group[number].window.future[frame]
+            errors[number, frame] = min(float(squared_errors(part.present[None], stored[None], scene.box)), worst)
+    return [
+        RolloutErrors(trajectory=start.trajectory, frame=start.window.frame, errors=found, diverged=reason)
+        for start, found, reason in zip(group, errors, diverged, strict=True)
+    ]
