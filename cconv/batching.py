@@ -13,9 +13,9 @@ from torch import Tensor
 
 from cconv.errors import ShapeError
 
-MOST_JOINED = (
-    10_000  # particles of one graph, a single window apart: beyond that joining hardly saves time, and memory grows
-)
+# Particles of a graph of several windows at most. Joining saves a constant time for each window after the first: half
+# of all for 100 particles, a tenth for 1,000, nothing for 2,500 (docs/performance.md).
+MOST_JOINED = 4096
 
 
 def index_of(counts: Sequence[int]) -> Int[Tensor, " N"]:

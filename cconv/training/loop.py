@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cconv.errors import check_choice
-from cconv.models.model import Model
+from cconv.models.model import FrameGeometry, Model
 from cconv.tasks.samples import Sample
 from cconv.training.averages import begin_average, update_average
 from cconv.training.batches import batches
@@ -163,7 +163,7 @@ def _update(
     optimizer.zero_grad()
     frames, total = sum(len(sample.origins) for sample in batch), 0.0
     for sample in batch:
-        loss = torch.stack(_losses(model, sample, geometry, weight, steps)).sum() / frames
+        loss = torch.stack(losses_of(model, sample, geometry, weight, steps)).sum() / frames
         loss.backward()
         total += loss.item()
     if math.isfinite(total):
@@ -171,10 +171,18 @@ def _update(
     return total
 
 
-def _losses(
-    model: Model, sample: Sample, geometry: GeometryCache, weight: FrameWeight, steps: int
+def losses_of(
+    model: Model, sample: Sample, geometry: Callable[[Sample], FrameGeometry], weight: FrameWeight, steps: int
 ) -> list[Float[Tensor, ""]]:
-    """Loss of each frame of a sample, the mean over its steps."""
+    """Loss of each frame of a sample, the mean over its steps.
+
+    Args:
+        model: The model.
+        sample: One frame, or several in one graph.
+        geometry: Function from a sample to its geometry, e.g. a cache.
+        weight: How much a frame counts, by its own target.
+        steps: Steps that are learned at once, of the model's own rollout.
+    """
     losses: list[list[Tensor]] = [[] for _ in sample.origins]
     for answers in unrolled(model, sample, steps, geometry):
         for window, prediction, target in answers:
