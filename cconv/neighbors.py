@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cconv.batching import check_batch_index, counts_of, index_of, joined_indices, joined_splits
 from cconv.cell_list import CellGrid, Cells, half_pairs, pairs_by_receiver, separations
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
@@ -31,6 +32,7 @@ class Edges:
         cutoff: Largest distance listed, inclusive.
         bipartite: Whether receivers and senders are different sets of points.
         includes_self: Whether each particle is listed as its own neighbour.
+        batch_index: Window of each receiver (N,) where several windows stand in one graph; None for one window.
     """
 
     receivers: Int[Tensor, " E"]
@@ -42,6 +44,7 @@ class Edges:
     cutoff: float
     bipartite: bool
     includes_self: bool
+    batch_index: Int[Tensor, " N"] | None = None
 
     @property
     def num_receivers(self) -> int:
@@ -84,7 +87,30 @@ class Edges:
             displacements=displacements,
             distances=self.distances.to(*args, **kwargs),
             row_splits=self.row_splits.to(device),
+            batch_index=None if self.batch_index is None else self.batch_index.to(device),
         )
+
+
+def join_edges(parts: Sequence[Edges]) -> Edges:
+    """Pairs of several windows in one graph, whose points stand one window after another.
+
+    Args:
+        parts: Pairs of each window, at least one, of the same cutoff and kind.
+    """
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    receivers = [part.num_receivers for part in parts]
+    return replace(
+        first,
+        receivers=joined_indices([part.receivers for part in parts], receivers),
+        senders=joined_indices([part.senders for part in parts], [part.num_senders for part in parts]),
+        displacements=torch.cat([part.displacements for part in parts]),
+        distances=torch.cat([part.distances for part in parts]),
+        row_splits=joined_splits([part.row_splits for part in parts]),
+        num_senders=sum(part.num_senders for part in parts),
+        batch_index=index_of(receivers).to(first.receivers.device),
+    )
 
 
 def radius_graph(
@@ -93,6 +119,8 @@ def radius_graph(
     box: Box | None = None,
     queries: Float[Tensor, "N D"] | None = None,
     include_self: bool = False,
+    batch_index: Int[Tensor, " M"] | None = None,
+    query_batch_index: Int[Tensor, " N"] | None = None,
 ) -> Edges:
     """All pairs within `cutoff`, found in a list of cells on the CPU.
 
@@ -106,6 +134,9 @@ def radius_graph(
         box: Domain with its periodic axes; None for open space.
         queries: Receiving points (N, D), e.g. fluid particles that look for boundary points.
         include_self: Whether a particle is its own neighbour; only without `queries`.
+        batch_index: Window of each sending point (M,), ascending, where points are those of several windows, which do
+            not see each other; None for one window.
+        query_batch_index: The same of the receiving points (N,), given exactly if there are `queries`.
 
     Returns:
         The pairs, sorted by receiver, then sender.
@@ -115,6 +146,32 @@ def radius_graph(
         ConfigError: If the cutoff is not positive or exceeds half of a periodic axis, or `include_self` comes with
             `queries`.
     """
+    if batch_index is None and query_batch_index is None:
+        return _graph_of_window(positions, cutoff, box, queries, include_self)
+    windows = _windows(positions, queries, batch_index, query_batch_index)
+    return join_edges([_graph_of_window(points, cutoff, box, asked, include_self) for points, asked in windows])
+
+
+def _windows(
+    positions: Tensor, queries: Tensor | None, batch_index: Tensor | None, query_batch_index: Tensor | None
+) -> list[tuple[Tensor, Tensor | None]]:
+    """Sending and receiving points of each window, the latter None if they are the same."""
+    if batch_index is None or (queries is None) != (query_batch_index is None):
+        raise ShapeError("`batch_index` must come with `positions`, and `query_batch_index` exactly with `queries`.")
+    check_batch_index("batch_index", batch_index, len(positions))
+    if queries is None or query_batch_index is None:
+        return [(points, None) for points in positions.split(counts_of(batch_index, 1))]
+    check_batch_index("query_batch_index", query_batch_index, len(queries))
+    counts = counts_of(batch_index, 1)
+    asked = counts_of(query_batch_index, len(counts))
+    counts += [0] * (len(asked) - len(counts))
+    return list(zip(positions.split(counts), queries.split(asked), strict=True))
+
+
+def _graph_of_window(
+    positions: Tensor, cutoff: float, box: Box | None, queries: Tensor | None, include_self: bool
+) -> Edges:
+    """`radius_graph` of one window."""
     receivers_at = positions if queries is None else queries
     _check_points(positions, receivers_at, box)
     _check_cutoff(cutoff, box)

@@ -81,6 +81,16 @@ def test_the_benchmark_of_rollouts_measures_time_and_memory(tmp_path):
     assert json.dumps(results["growth"]) in printed
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
+def test_the_benchmark_of_joined_windows_compares_both_ways(flow_folder, tmp_path):
+    run("joined", "--data", flow_folder, "--out", tmp_path)
+    results = json.loads((tmp_path / "joined.json").read_text())
+    (row,) = results["data"]
+    for work in ("training_step", "validation"):
+        assert all(row[work][way]["median"] > 0 for way in ("joined", "one by one", "one by one / joined"))
+
+
 def test_growth_is_that_of_times_and_memory_that_are_known(benchmark_script):
     particles = [1000, 3000, 10_000]
     rows = [{"cpu_ms": {"median": 2 * n**1.1}, "ms": {"median": n**0.9}, "added_mb": 20 + 0.004 * n} for n in particles]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from oracles.brute_force_neighbors import brute_force_pairs
 
+from cconv.batching import index_of
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import half_list, radius_graph
@@ -369,3 +370,38 @@ def test_include_self_with_queries_is_refused():
     points = torch.zeros(2, 2, dtype=torch.float64)
     with pytest.raises(ConfigError, match="include_self"):
         radius_graph(points, 0.1, queries=points, include_self=True)
+
+
+def test_points_of_several_windows_see_their_own_window_alone(generator):
+    """One window has no points, one has no queries, and the last has queries alone."""
+    box, sizes, asked = box_of((True, False)), (30, 0, 12, 20, 0), (9, 4, 7, 0, 3)
+    points, queries = ([cloud(generator, count, box) for count in counts] for counts in (sizes, asked))
+    given = torch.cat(points), 0.2, box
+    for edges, parts, counts in (
+        (radius_graph(*given, batch_index=index_of(sizes)), [radius_graph(each, 0.2, box) for each in points], sizes),
+        (
+            radius_graph(
+                *given, queries=torch.cat(queries), batch_index=index_of(sizes), query_batch_index=index_of(asked)
+            ),
+            [radius_graph(*pair) for pair in zip(points, [0.2] * 5, [box] * 5, queries, strict=True)],
+            asked,
+        ),
+    ):
+        edges.check()
+        assert_rows_are_compressed(edges)
+        assert (edges.num_receivers, edges.num_senders) == (sum(counts), sum(sizes))
+        assert torch.equal(edges.batch_index, index_of(counts))
+        assert torch.equal(edges.displacements, torch.cat([part.displacements for part in parts]))
+        assert torch.equal(edges.distances, torch.cat([part.distances for part in parts]))
+        firsts = [sum(sizes[:window]) for window in range(5)]
+        senders = [part.senders + first for part, first in zip(parts, firsts, strict=True)]
+        assert torch.equal(edges.senders, torch.cat(senders))
+        assert torch.equal(edges.row_splits.diff(), torch.cat([part.row_splits.diff() for part in parts]))
+
+
+def test_queries_and_their_batch_index_come_together(generator):
+    points = torch.rand(4, 2, generator=generator)
+    with pytest.raises(ShapeError, match="exactly with `queries`"):
+        radius_graph(points, 0.2, queries=points, batch_index=index_of([4]))
+    with pytest.raises(ShapeError, match="must come with `positions`"):
+        radius_graph(points, 0.2, queries=points, query_batch_index=index_of([4]))

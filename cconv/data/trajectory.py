@@ -30,10 +30,12 @@ class Boundary:
     Attributes:
         positions: (B, D), length.
         normals: Unit normals (B, D), or None where the data hold none.
+        batch_index: Window that each point belongs to (B,) where there are several; None for one.
     """
 
     positions: Tensor
     normals: Tensor | None
+    batch_index: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,19 +3,34 @@
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from cconv.batching import counts_of, groups_of, index_of
 from cconv.data.trajectory import Boundary, ParticleType, Trajectory
 from cconv.domain import Box
 from cconv.errors import DataError, ShapeError
 
 
+class Origin(NamedTuple):
+    """Where a window comes from.
+
+    Attributes:
+        trajectory: Name of the trajectory.
+        frame: Index of its present in the stored trajectory.
+    """
+
+    trajectory: str
+    frame: int
+
+
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """Consecutive frames of a trajectory, the last of which is the present.
+    """Consecutive frames of a trajectory, the last of which is the present; or several such windows, joined.
+
+    The particles of joined windows stand one window after another, those of a window together.
 
     Attributes:
         positions: The past and the present, (H, N, D), length.
@@ -23,8 +38,10 @@ class Window:
         masses: (N,).
         particle_types: (N,), int64, values of `ParticleType`.
         boundary: Wall points, or None.
-        trajectory: Name of the trajectory.
-        frame: Index of the present in the stored trajectory.
+        trajectory: Name of the trajectory, of the first window if several are joined.
+        frame: Index of the present in the stored trajectory, of the first window if several are joined.
+        batch_index: Window that each particle belongs to, (N,), ascending, if several are joined; None for one.
+        joined: Where each of them comes from; empty for one.
     """
 
     positions: Tensor
@@ -34,6 +51,13 @@ class Window:
     boundary: Boundary | None
     trajectory: str
     frame: int
+    batch_index: Tensor | None = None
+    joined: tuple[Origin, ...] = ()
+
+    @property
+    def origins(self) -> tuple[Origin, ...]:
+        """Where the window comes from, or each of the joined ones."""
+        return self.joined or (Origin(self.trajectory, self.frame),)
 
     @property
     def present(self) -> Tensor:
@@ -73,7 +97,96 @@ class Window:
     def followed_by(self, positions: Tensor) -> "Window":
         """The window a frame later, whose present is `positions` (N, D); as long as this one."""
         past = torch.cat([self.positions[1:], positions[None]])
-        return replace(self, positions=past, future=self.future[1:], frame=self.frame + 1)
+        joined = tuple(Origin(trajectory, frame + 1) for trajectory, frame in self.joined)
+        return replace(self, positions=past, future=self.future[1:], frame=self.frame + 1, joined=joined)
+
+    def separated(self) -> list["Window"]:
+        """Return the windows that are joined, or this one alone."""
+        if self.batch_index is None:
+            return [self]
+        counts = counts_of(self.batch_index, len(self.joined))
+        boundaries = _separated_boundaries(self.boundary, len(counts))
+        parts = zip(
+            self.positions.split(counts, dim=1),
+            self.future.split(counts, dim=1),
+            self.masses.split(counts),
+            self.particle_types.split(counts),
+            boundaries,
+            self.joined,
+            strict=True,
+        )
+        return [
+            Window(
+                positions=positions,
+                future=future,
+                masses=masses,
+                particle_types=types,
+                boundary=boundary,
+                trajectory=origin.trajectory,
+                frame=origin.frame,
+            )
+            for positions, future, masses, types, boundary, origin in parts
+        ]
+
+    def only(self, kept: Sequence[bool]) -> "Window":
+        """Return some of the windows that are joined, at least one.
+
+        Args:
+            kept: Whether each of them is kept.
+        """
+        if all(kept):
+            return self
+        return join_windows([window for window, keep in zip(self.separated(), kept, strict=True) if keep])
+
+
+def join_windows(windows: Sequence[Window]) -> Window:
+    """Join windows of a group of `joinable`, at least one, so that they are asked about together."""
+    first = windows[0]
+    if len(windows) == 1:
+        return first
+    return replace(
+        first,
+        positions=torch.cat([window.positions for window in windows], dim=1),
+        future=torch.cat([window.future for window in windows], dim=1),
+        masses=torch.cat([window.masses for window in windows]),
+        particle_types=torch.cat([window.particle_types for window in windows]),
+        boundary=_joined_boundaries([window.boundary for window in windows if window.boundary is not None]),
+        batch_index=index_of([len(window.masses) for window in windows]),
+        joined=tuple(origin for window in windows for origin in window.origins),
+    )
+
+
+def joinable(windows: Sequence[Window]) -> list[list[int]]:
+    """Groups of the numbers of windows to join: alike in frames and in walls, with not too many particles together."""
+    return groups_of([len(window.masses) for window in windows], [_kind(window) for window in windows])
+
+
+def _kind(window: Window) -> tuple:
+    walls = window.boundary is not None, window.boundary is not None and window.boundary.normals is not None
+    frames = len(window.positions), len(window.future), window.positions.dtype, window.future.dtype
+    return *frames, *walls, bool(window.is_fluid.all())
+
+
+def _joined_boundaries(boundaries: Sequence[Boundary]) -> Boundary | None:
+    """Walls of all windows, None where there are none."""
+    if not boundaries:
+        return None
+    normals = [boundary.normals for boundary in boundaries if boundary.normals is not None]
+    return Boundary(
+        positions=torch.cat([boundary.positions for boundary in boundaries]),
+        normals=torch.cat(normals) if normals else None,
+        batch_index=index_of([len(boundary.positions) for boundary in boundaries]),
+    )
+
+
+def _separated_boundaries(boundary: Boundary | None, windows: int) -> Sequence[Boundary | None]:
+    """Walls of each of so many windows."""
+    if boundary is None or boundary.batch_index is None:
+        return [boundary] * windows
+    counts = counts_of(boundary.batch_index, windows)
+    normals = [None] * windows if boundary.normals is None else boundary.normals.split(counts)
+    parts = zip(boundary.positions.split(counts), normals, strict=True)
+    return [Boundary(positions=positions, normals=some) for positions, some in parts]
 
 
 def window_at(trajectory: Trajectory, present: int, history: int, future: int) -> Window:

@@ -23,7 +23,8 @@ from cconv.networks.counting import CountedCost, NeighborDensity
 from cconv.ops.workers import torch_threads
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
-from cconv.tasks.features import FluidState, Inputs
+from cconv.tasks.features import FluidState
+from cconv.tasks.inputs import Inputs
 from cconv.tasks.task import FieldTask, StepTask, Task, as_field
 
 ANALYTIC = "analytic SPH"  # its name among the models that it is timed in turn with

@@ -25,7 +25,8 @@ from cconv.networks.network import ConvolutionNetwork, ConvolutionSettings
 from cconv.nn.filters import window_values
 from cconv.nn.kinds import split_kinds
 from cconv.sph.operators import density
-from cconv.tasks.features import DENSITY, VELOCITY, Features, FluidState, Inputs
+from cconv.tasks.features import DENSITY, VELOCITY, FluidState
+from cconv.tasks.inputs import Features, Inputs
 from cconv.tasks.samples import Sample
 from cconv.tasks.task import as_field
 

@@ -8,12 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.trajectory import Scene
-from cconv.data.window import Window
+from cconv.data.window import Window, join_windows, joinable
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.evaluation.rollout_metrics import squared_errors
+from cconv.models.model import Model
 from cconv.rollout.correctors import Corrector, correctors_of
-from cconv.rollout.rollout import Diverged, StepModel, advance
+from cconv.rollout.rollout import Diverged, StepModel, begun, followed
 from cconv.tasks.samples import Sample, StepSample
 from cconv.tasks.task import as_step
 
@@ -47,9 +48,10 @@ def worst_error(box: Box) -> float:
     return float(np.mean([(length / 2) ** 2 for length in box.lengths]))
 
 
-def rollouts_of(model: StepModel, samples: Iterable[Sample]) -> list[RolloutErrors]:
+def rollouts_of(model: Model, samples: Iterable[Sample]) -> list[RolloutErrors]:
     """Roll a model out, with its relaxation, from samples of its task, for as many frames as are known after each."""
-    return [rollout_errors_of(model, start, correctors_of(model)) for start in starts(samples)]
+    asked = [replace(start, task=as_step(model.task)) for start in starts(samples)]  # its integrator may be another
+    return joined_errors(model.predict_frame, asked, correctors_of(model))
 
 
 def rollout_errors_of(model: StepModel, start: StepSample, correctors: Sequence[Corrector] = ()) -> RolloutErrors:
@@ -63,7 +65,7 @@ def constant_rollouts(answer: Float[Tensor, " C"], samples: Iterable[Sample]) ->
     def predict(window: Window, scene: Scene) -> Tensor:
         return answer.expand(int(window.is_fluid.sum()), -1)
 
-    return [rollout_errors(predict, start) for start in starts(samples)]
+    return joined_errors(predict, starts(samples))
 
 
 def starts(samples: Iterable[Sample]) -> list[StepSample]:
@@ -82,17 +84,61 @@ def rollout_errors(
     predict: Callable[[Window, Scene], Tensor], start: StepSample, correctors: Sequence[Corrector] = ()
 ) -> RolloutErrors:
     """Errors of one rollout in each frame that is known after its start; arguments as of `advance`."""
-    scene, future = start.scene, start.window.future
+    (errors,) = _errors_of_group(predict, [start], correctors)
+    return errors
+
+
+def joined_errors(
+    predict: Callable[[Window, Scene], Tensor], begun_at: Sequence[StepSample], correctors: Sequence[Corrector] = ()
+) -> list[RolloutErrors]:
+    """Errors of several rollouts, which advance together where their windows can be joined.
+
+    A rollout that diverges leaves the others, and its further frames count as the worst.
+
+    Args:
+        predict: One window, or several joined, and their scene to the answer (M, D) for each of the M fluid particles.
+        begun_at: Starts of the rollouts, of one task, in any scenes.
+        correctors: What corrects every frame, one after another.
+    """
+    found: dict[int, RolloutErrors] = {}
+    scenes = {id(start.scene): start.scene for start in begun_at}
+    for scene in scenes.values():
+        numbers = [number for number, start in enumerate(begun_at) if start.scene is scene]
+        for group in joinable([begun_at[number].window for number in numbers]):
+            together = [numbers[place] for place in group]
+            errors = _errors_of_group(predict, [begun_at[number] for number in together], correctors)
+            found |= dict(zip(together, errors, strict=True))
+    return [found[number] for number in range(len(begun_at))]
+
+
+def _errors_of_group(
+    predict: Callable[[Window, Scene], Tensor], group: Sequence[StepSample], correctors: Sequence[Corrector]
+) -> list[RolloutErrors]:
+    """Errors of rollouts that begin with windows that can be joined."""
+    scene, integrator = group[0].scene, group[0].task.integrator
     worst = worst_error(scene.box)
-    errors = np.full(len(future), worst)
-    path = advance(predict, start.task.integrator, start.window, scene, correctors=correctors)
-    diverged, last = None, start.window.present.double()
-    try:
-        for place, window in zip(range(len(future)), path, strict=False):
-            found = float(squared_errors(window.present[None], future[place][None], scene.box))
-            errors[place], last = min(found, worst), window.present
-    except Diverged as error:
-        diverged = error.reason
-    return RolloutErrors(
-        trajectory=start.trajectory, frame=start.window.frame, errors=errors, diverged=diverged, last=last
-    )
+    errors = np.full((len(group), len(group[0].window.future)), worst)
+    diverged: list[str | None] = [None] * len(group)
+    last = [start.window.present.double() for start in group]
+    window, going = begun(join_windows([start.window for start in group])), list(range(len(group)))
+    for frame in range(errors.shape[1]):
+        try:
+            window, ends = followed(predict, integrator, window, scene, correctors)
+        except Diverged as error:  # of a solver in the place of a model
+            ends = [error] * len(going)
+        for number, end in zip(going, ends, strict=True):
+            diverged[number] = None if end is None else end.reason
+        going = [number for number in going if diverged[number] is None]
+        if not going:
+            break
+        window = window.only([end is None for end in ends])
+        for number, part in zip(going, window.separated(), strict=True):
+            stored = group[number].window.future[frame]
+            last[number] = part.present
+            errors[number, frame] = min(float(squared_errors(part.present[None], stored[None], scene.box)), worst)
+    return [
+        RolloutErrors(
+            trajectory=start.trajectory, frame=start.window.frame, errors=found, diverged=reason, last=reached
+        )
+        for start, found, reason, reached in zip(group, errors, diverged, last, strict=True)
+    ]

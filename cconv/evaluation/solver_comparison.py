@@ -7,10 +7,10 @@ import numpy as np
 
 from cconv.data.restart import restart
 from cconv.data.splits import evenly_spaced
-from cconv.evaluation.rollout_errors import RolloutErrors, rollouts_of
+from cconv.evaluation.rollout_errors import RolloutErrors, rollout_errors_of
 from cconv.evaluation.solver_cost import SolverCost, measure_state
-from cconv.models.model import Model
 from cconv.rollout.coarse_solver_model import CoarseSolverModel
+from cconv.rollout.rollout import StepModel
 from cconv.rollout.solver_model import SolverModel
 from cconv.scenes.coarse import coarse_state, coarser_scenes
 from cconv.scenes.simulated_scene import SimulatedScene
@@ -65,17 +65,22 @@ def measure_solvers(
     """
     task, state = starts[0].task, restart(scene, starts[0].window).state
     cost = measure_state(scene, state, threads=threads, repeats=REPEATS)
-    found = [MeasuredSolver(factor=1.0, cost=cost, errors=tuple(rollouts_of(SolverModel(scene, task), starts)))]
+    found = [MeasuredSolver(factor=1.0, cost=cost, errors=_errors(SolverModel(scene, task), starts))]
     for coarse in coarser_scenes(scene):
         if found[-1].cost.ms_per_frame <= until_ms:
             break
         cost = measure_state(coarse, coarse_state(scene, coarse, state), threads=threads, repeats=REPEATS)
         factor = coarse.particle_spacing / scene.particle_spacing
-        errors = tuple(rollouts_of(CoarseSolverModel(scene, coarse, task), starts))
+        errors = _errors(CoarseSolverModel(scene, coarse, task), starts)
         found.append(MeasuredSolver(factor=factor, cost=cost, errors=errors))
     return found
 
 
-def mean_error(models: Iterable[Model], starts: Sequence[StepSample]) -> float:
+def _errors(model: StepModel, starts: Sequence[StepSample]) -> tuple[RolloutErrors, ...]:
+    """Errors of rollouts, one after another: a solver has a state, so that windows cannot be joined."""
+    return tuple(rollout_errors_of(model, start) for start in starts)
+
+
+def mean_error(models: Iterable[StepModel], starts: Sequence[StepSample]) -> float:
     """Error of the rollouts of some models from the starts, the mean over both."""
-    return float(np.mean([each.error for model in models for each in rollouts_of(model, starts)]))
+    return float(np.mean([each.error for model in models for each in _errors(model, starts)]))

@@ -12,7 +12,7 @@ from cconv.models.model import Model, build_model
 from cconv.networks import RadialNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.tasks import task_named
-from cconv.tasks.features import Inputs
+from cconv.tasks.inputs import Inputs
 from cconv.tasks.samples import Sample, iterate_samples
 from cconv.tasks.task import as_field
 

@@ -23,7 +23,8 @@ from cconv.nn.kinds import Kinds
 from cconv.ops.workers import results_of
 from cconv.sph.kernels import KERNELS, AbstractKernel
 from cconv.tasks import TASKS, task_named
-from cconv.tasks.features import CONSTANT, WALLS, Inputs
+from cconv.tasks.features import CONSTANT, WALLS
+from cconv.tasks.inputs import Inputs
 from cconv.tasks.samples import Sample
 from cconv.tasks.task import StepTask, Task, as_step
 from cconv.validation import Length, Real, StrictModel, Whole, validated
@@ -34,7 +35,7 @@ MOST_PARAMETERS = 10**8  # with Adam's moments 1.6 GB
 class ModelConfig(StrictModel):
     """Everything that rebuilds a model except its weights; stored as `config.json`.
 
-    The network computes in particle spacings, rest densities and frame intervals (`cconv.tasks.features.Units`).
+    The network computes in particle spacings, rest densities and frame intervals (`cconv.tasks.inputs.Units`).
     `relative_smoothing_length` is the kernel's h in particle spacings. `particle_spacing` and `frame_dt` are those of
     the training data, for the record. `history` is the number of frames that an answer depends on. `features` names the
     features of the task that are inputs of the model.
@@ -115,7 +116,7 @@ class ModelConfig(StrictModel):
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """Geometry of one frame, shared by all layers.
+    """Geometry of one frame, or of several in one graph, shared by all layers.
 
     Attributes:
         fluid: Fluid particles seen from fluid particles.
@@ -129,6 +130,20 @@ class FrameGeometry:
     def nbytes(self) -> int:
         """Memory that the geometry takes at most, in bytes."""
         return self.fluid.nbytes + (0 if self.walls is None else self.walls.nbytes)
+
+
+def join_geometries(parts: Sequence[FrameGeometry]) -> FrameGeometry:
+    """Geometry of several frames, at least one, in one graph; all have walls or none."""
+    if len(parts) == 1:
+        return parts[0]
+    walls = [part.walls for part in parts if part.walls is not None]
+    return FrameGeometry(_joined([part.fluid for part in parts]), _joined(walls) if walls else None)
+
+
+def _joined(parts: Sequence[Any]) -> Geometry:
+    """Geometries of one class in one graph."""
+    first, *others = parts
+    return first.joined_with(others)
 
 
 class Model(nn.Module):
@@ -196,16 +211,27 @@ class Model(nn.Module):
         return self.task.kernel_at(particle_spacing, self.config.dim)
 
     def geometry(self, inputs: Inputs) -> FrameGeometry:
-        """Compute the neighbours of a frame and the geometry that the network reads.
+        """Compute the neighbours of a frame, or of each of several, and the geometry that the network reads.
 
         Raises:
             ShapeError: If the frame has another dimension or other walls than the model.
         """
         self._check(inputs)
         cutoff = self.settings.relative_cutoff
-        searches = [partial(radius_graph, inputs.positions, cutoff, inputs.box)]
+        points, index = inputs.positions, inputs.batch_index
+        searches = [partial(radius_graph, points, cutoff, inputs.box, batch_index=index)]
         if self.config.walls and inputs.wall_positions is not None:
-            searches.append(partial(radius_graph, inputs.wall_positions, cutoff, inputs.box, queries=inputs.positions))
+            searches.append(
+                partial(
+                    radius_graph,
+                    inputs.wall_positions,
+                    cutoff,
+                    inputs.box,
+                    queries=points,
+                    batch_index=inputs.wall_batch_index,
+                    query_batch_index=index,
+                )
+            )
         fluid, *walls = map(self.settings.geometry, results_of(searches))
         return FrameGeometry(fluid, walls[0] if walls else None)
 

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cconv.nn.kinds import Kinds
-from cconv.tasks.features import CONSTANT, Features
+from cconv.tasks.features import CONSTANT
+from cconv.tasks.inputs import Features
 
 
 @dataclass(frozen=True)

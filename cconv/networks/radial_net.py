@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from cconv.batching import means_of_windows
 from cconv.errors import ConfigError, check_choice
 from cconv.neighbors import Edges
 from cconv.networks.conv_net import ACTIVATIONS
@@ -87,9 +88,9 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         dim: Number of space dimensions D.
         activation: "relu", "gelu", "tanh" or "leaky_relu", of scalars.
         message: Name in `cconv.nn.radial_conv.MESSAGES`, of all fluid convolutions.
-        conserves_momentum: Whether predicted vectors have the sum 0 over all particles. The last layer then has
-            "opposite" messages, which pairs of particles give to each other with opposite signs, and its linear map
-            takes differences from the mean over the particles.
+        conserves_momentum: Whether predicted vectors have the sum 0 over all particles of each window. The last layer
+            then has "opposite" messages, which pairs of particles give to each other with opposite signs, and its
+            linear map takes differences from the mean over these particles.
         residual: Whether outputs of layers of equal width are added up.
         generator: Source of the initial weights; None for torch's global one.
 
@@ -134,16 +135,16 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         """Linear map of the first layer, if there is one."""
         return self.dense[0] if any(self.own_channels) else None
 
-    def own(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C_own"]:
+    def own(self, features: Float[Tensor, "N C"], geometry: RadialGeometry) -> Float[Tensor, "N C_own"]:
         """Select the inputs of that map from features (N, S + V · D)."""
         own = self.own_channels
         scalars, vectors = split_kinds(features, self.convs[0].in_channels, self.dim)
         selected = join_kinds(scalars[:, scalars.shape[1] - own.scalars :], vectors[:, : own.vectors])
-        return self._mapped_last(selected) if len(self.convs) == 1 else selected
+        return self._mapped_last(selected, geometry) if len(self.convs) == 1 else selected
 
-    def _mapped_last(self, values: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
-        """Inputs of the linear map of the last layer, whose outputs add up to 0 if momentum is conserved."""
-        return values - values.mean(dim=0) if self.conserves_momentum else values
+    def _mapped_last(self, values: Float[Tensor, "N C"], geometry: RadialGeometry) -> Float[Tensor, "N C"]:
+        """Inputs of the linear map of the last layer, whose outputs add up to 0 in a window that conserves momentum."""
+        return values - means_of_windows(values, geometry.batch_index) if self.conserves_momentum else values
 
     def forward(
         self,
@@ -154,13 +155,13 @@ class RadialNet(ConvolutionNetwork[RadialGeometry, RadialConv]):
         """Scalars and vectors of the last layer, (N, S + V · D), of such values of its inputs; see `Network`."""
         output = self.convs[0](features, geometry)
         if self.own_dense is not None:
-            output = output + self.own_dense(self.own(features))
+            output = output + self.own_dense(self.own(features, geometry))
         for conv, seen in with_inputs(self.boundary_conv, walls):
             output = output + conv(seen.features, seen.geometry)
         following_dense = self.dense[any(self.own_channels) :]
         for channels, conv, dense in zip(self.hidden_channels, self.convs[1:], following_dense, strict=True):
             activated = self._activate(output, channels)
-            mapped = self._mapped_last(activated) if conv is self.convs[-1] else activated
+            mapped = self._mapped_last(activated, geometry) if conv is self.convs[-1] else activated
             following = conv.convolve(activated, geometry) + dense(mapped)
             output = following + output if self.residual and following.shape == output.shape else following
         return output
@@ -189,7 +190,8 @@ class RadialTerms(LinearTerms[RadialGeometry]):
         boundary = with_inputs(self.network.boundary_conv, walls)
         gathered = [conv.columns(seen.features, seen.geometry) for conv, seen in boundary]
         gathered.append(self.network.convs[0].columns(features, geometry))
-        scalars, vectors = split_kinds(self.network.own(features), self.network.own_channels, self.network.dim)
+        own = self.network.own(features, geometry)
+        scalars, vectors = split_kinds(own, self.network.own_channels, self.network.dim)
         of_scalars = [*(to_scalars for to_scalars, _ in gathered), scalars]
         if self.network.own_dense is not None and self.network.own_dense.bias is not None:
             of_scalars.append(torch.ones_like(features[:, :1]))

@@ -16,6 +16,7 @@ The geometry of a set of edges is computed once and shared by all layers with th
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from cconv.nn.filters import (
     window_values,
 )
 from cconv.ops.convolution import convolve
-from cconv.ops.filter_reads import FilterReads
+from cconv.ops.filter_reads import FilterReads, join_reads
 
 MESSAGES = {"absolute": 0, "difference": -1, "sum": 1}
 INITIALIZATIONS = ("xavier_uniform", "open3d", "thesis")
@@ -87,6 +88,12 @@ class ConvGeometry:
             self.reads = _filter_reads(
                 edges, self.kernel_size, mapping, window, interpolation, align_corners, normalize
             )
+
+    def joined_with(self, others: "Sequence[ConvGeometry]") -> "ConvGeometry":
+        """The geometry of this window and of others in one graph; all with the same settings."""
+        joined = copy(self)
+        joined.reads = join_reads([self.reads, *(other.reads for other in others)])
+        return joined
 
     @property
     def num_receivers(self) -> int:

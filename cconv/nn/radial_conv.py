@@ -19,16 +19,16 @@ and differences of vectors: what two particles add to each other's vectors is eq
 all particles is 0.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
-from cconv.neighbors import Edges
+from cconv.neighbors import Edges, join_edges
 from cconv.nn.continuous_conv import (
     check_finite,
     check_kind,
@@ -85,6 +85,16 @@ class RadialGeometry:
         self.receivers, self.senders, self.num_senders = edges.receivers, edges.senders, edges.num_senders
         self._window, self._normalize = window, normalize
         self._differentiates = torch.is_grad_enabled() and not detach_positions
+
+    def joined_with(self, others: "Sequence[RadialGeometry]") -> "RadialGeometry":
+        """The geometry of this window and of others in one graph; all with the same settings."""
+        edges = join_edges([self.edges, *(other.edges for other in others)])
+        return RadialGeometry(edges, self.num_terms, self._window, self._normalize, not self._differentiates)
+
+    @property
+    def batch_index(self) -> Int[Tensor, " N"] | None:
+        """Window of each receiver (N,) where several windows stand in one graph; None for one window."""
+        return self.edges.batch_index
 
     @property
     def dim(self) -> int:

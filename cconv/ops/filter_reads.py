@@ -1,12 +1,13 @@
 """Interpolation stencils: the cells of the filter grid that each edge reads, and their weights."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from cconv.batching import joined_indices, joined_splits
 from cconv.ops import gathers
 
 
@@ -74,3 +75,17 @@ class FilterReads:
             for axis, fraction in enumerate(self.fractions.unbind(1)):
                 weights = weights * (fraction if corner >> axis & 1 else 1 - fraction)
             yield self.cells.long() + offset, weights
+
+
+def join_reads(parts: Sequence[FilterReads]) -> FilterReads:
+    """Reads of several windows in one graph, whose points stand one window after another; all read the same grid."""
+    return replace(
+        parts[0],
+        row_splits=joined_splits([part.row_splits for part in parts]),
+        receivers=joined_indices([part.receivers for part in parts], [part.num_receivers for part in parts]),
+        senders=joined_indices([part.senders for part in parts], [part.num_senders for part in parts]),
+        cells=torch.cat([part.cells for part in parts]),
+        fractions=torch.cat([part.fractions for part in parts]),
+        weights=torch.cat([part.weights for part in parts]),
+        num_senders=sum(part.num_senders for part in parts),
+    )

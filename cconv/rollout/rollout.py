@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from cconv.batching import largest_of_windows
 from cconv.data.trajectory import Scene
-from cconv.data.window import Window
+from cconv.data.window import Window, join_windows
 from cconv.errors import CConvError, SimulationError
 from cconv.rollout.correctors import Corrector, correctors_of
 from cconv.tasks.integrators import Integrator
@@ -80,48 +82,104 @@ def advance(
     Raises:
         Diverged: If the next frame would not be a state of particles any more, or cannot be corrected.
     """
-    window = replace(start, positions=start.positions.double())
+    window = begun(start)
     while True:
-        before, window = window, integrator.advance(window, predict(window, scene), scene)
-        check_state(window, scene)
-        for corrector in correctors:
-            window = _corrected(corrector, before, window, scene)
+        window, (end,) = followed(predict, integrator, window, scene, correctors)
+        if end is not None:
+            raise end
         yield window
 
 
-def _corrected(corrector: Corrector, before: Window, after: Window, scene: Scene) -> Window:
-    try:
-        corrected = corrector(before, after, scene)
-    except SimulationError as error:
-        raise Diverged(after.frame, str(error).removesuffix(".")) from error
-    check_state(corrected, scene)
-    return corrected
+def begun(start: Window) -> Window:
+    """The window that a rollout begins with, in float64."""
+    return replace(start, positions=start.positions.double())
+
+
+def followed(
+    predict: Callable[[Window, Scene], Tensor],
+    integrator: Integrator,
+    window: Window,
+    scene: Scene,
+    correctors: Sequence[Corrector] = (),
+) -> tuple[Window, list[Diverged | None]]:
+    """The window a frame later, or several that are joined.
+
+    Args:
+        predict: Window and scene to the answer (M, D) for each of the M fluid particles.
+        integrator: What turns an answer into the next frame.
+        window: One window or several.
+        scene: Their scene.
+        correctors: What corrects every frame, one after another.
+
+    Returns:
+        What follows, and of each window why nothing can follow any more; None where it can. Whoever goes on leaves the
+        former out (`Window.only`): their particles may be anywhere, so that a search for neighbours has no bound.
+    """
+    following = integrator.advance(window, predict(window, scene), scene)
+    ends = find_ends(following, scene)
+    if not correctors:
+        return following, ends
+    parts = zip(window.separated(), following.separated(), ends, strict=True)
+    corrected = [_corrected(correctors, before, after, scene, end) for before, after, end in parts]
+    return join_windows([after for after, _ in corrected]), [end for _, end in corrected]
+
+
+def _corrected(
+    correctors: Sequence[Corrector], before: Window, after: Window, scene: Scene, end: Diverged | None
+) -> tuple[Window, Diverged | None]:
+    """A single window after correction, and why nothing can follow any more."""
+    for corrector in correctors:
+        if end is None:
+            try:
+                after = corrector(before, after, scene)
+            except SimulationError as error:
+                end = Diverged(after.frame, str(error).removesuffix("."))
+                end.__cause__ = error
+            else:
+                (end,) = find_ends(after, scene)
+    return after, end
 
 
 @torch.no_grad()
-def check_state(window: Window, scene: Scene) -> None:
-    """Check that the present frame can be asked about: finite, without leaps, with a bounded number of neighbours.
+def find_ends(window: Window, scene: Scene) -> list[Diverged | None]:
+    """Find the windows, among one or several joined, that cannot be asked about.
 
-    Raises:
-        Diverged: With the reason.
+    Their present frame must be finite, without leaps, with a bounded number of neighbours.
+
+    Returns:
+        Why each cannot be asked about; None where it can.
     """
-    present, spacing = window.present, scene.particle_spacing
-    if not torch.isfinite(present).all():
-        raise Diverged(window.frame, "positions are not finite")
-    farthest = float(window.last_displacements(scene.box).norm(dim=1).max()) / spacing
+    present, origins = window.present, window.origins
+    index = torch.zeros(len(present), dtype=torch.int64) if window.batch_index is None else window.batch_index
+    steps = window.last_displacements(scene.box).norm(dim=1) / scene.particle_spacing
+    cells = torch.floor(present.double() / (2 * scene.particle_spacing)).long()
+    broken = largest_of_windows((~torch.isfinite(present)).any(dim=1).long(), index, len(origins))
+    farthest = largest_of_windows(steps, index, len(origins))
+    fullest = _most_in_a_cell(cells, index, len(origins))
+    reasons = map(partial(_reason, dim=scene.dim), broken, farthest, fullest)
+    found = zip(origins, reasons, strict=True)
+    return [None if reason is None else Diverged(origin.frame, reason) for origin, reason in found]
+
+
+def _reason(broken: int, farthest: float, fullest: int, dim: int) -> str | None:
+    """Why a window cannot be asked about; None if it can."""
+    if broken:
+        return "positions are not finite"
     if farthest > FARTHEST_STEP:
-        raise Diverged(window.frame, f"a particle moved {farthest:.3g} spacings in a frame")
-    fullest = _most_in_a_cell(torch.floor(present.double() / (2 * spacing)).long())
-    if fullest > MOST_IN_A_CELL * 2**scene.dim:
-        raise Diverged(window.frame, f"{fullest} particles clumped within two spacings")
+        return f"a particle moved {farthest:.3g} spacings in a frame"
+    if fullest > MOST_IN_A_CELL * 2**dim:
+        return f"{fullest} particles clumped within two spacings"
+    return None
 
 
-def _most_in_a_cell(cells: Tensor) -> int:
-    """Largest number of points whose cells (N, D) are the same."""
+def _most_in_a_cell(cells: Tensor, batch_index: Tensor, windows: int) -> list[int]:
+    """Largest number of points of each of so many windows whose cells (N, D) are the same."""
     # Torch takes twenty times as long for rows as for a number of each cell. Only occupied places along an axis count:
     # with a particle far away, all cells would be too many to number.
-    numbers = torch.zeros_like(cells[:, 0])
+    numbers, cells_of_window = batch_index, 1
     for along in cells.unbind(dim=1):
         occupied, places = along.unique(return_inverse=True)
         numbers = numbers * len(occupied) + places
-    return int(numbers.unique(return_counts=True)[1].max())
+        cells_of_window *= len(occupied)
+    found, counts = numbers.unique(return_counts=True)
+    return largest_of_windows(counts, found // cells_of_window, windows)

@@ -12,8 +12,8 @@ from cconv.tasks.features import (
     WALL_DISTANCE,
     WALL_NORMAL,
     WALLS,
-    Units,
 )
+from cconv.tasks.inputs import Units
 from cconv.tasks.integrators import SemiImplicitEuler
 from cconv.tasks.task import StepTask
 

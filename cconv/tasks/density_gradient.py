@@ -6,7 +6,8 @@ from torch import Tensor
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.operators import density_gradient
-from cconv.tasks.features import FluidState, Units
+from cconv.tasks.features import FluidState
+from cconv.tasks.inputs import Units
 from cconv.tasks.task import FieldTask
 
 
@@ -26,7 +27,7 @@ class DensityGradient(FieldTask):
         """Gradients of density (N, D)."""
         return density_gradient(state.masses, state.densities, state.edges, state.kernel)
 
-    def unit(self, units: Units) -> float:
+    def unit(self, units: Units) -> float | Tensor:
         """Rest density a particle spacing."""
         return units.density / units.length
 

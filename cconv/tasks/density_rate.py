@@ -6,7 +6,8 @@ from torch import Tensor
 from cconv.nn.kinds import Kinds
 from cconv.sph.compiled import CompiledSums
 from cconv.sph.operators import density_rate
-from cconv.tasks.features import FluidState, Units
+from cconv.tasks.features import FluidState
+from cconv.tasks.inputs import Units
 from cconv.tasks.task import FieldTask
 
 
@@ -26,7 +27,7 @@ class DensityRate(FieldTask):
         """Rates of density (N, 1)."""
         return density_rate(state.masses, state.velocities, state.edges, state.kernel)[:, None]
 
-    def unit(self, units: Units) -> float:
+    def unit(self, units: Units) -> float | Tensor:
         """Rest density a frame's time."""
         return units.density / units.time
 

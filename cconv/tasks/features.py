@@ -1,8 +1,4 @@
-"""What a network is given: named scalars and vectors of fluid particles and wall points.
-
-Networks know no metres, kilograms or seconds: lengths are in particle spacings, densities in rest densities, times in
-intervals of stored frames. So a network holds at every resolution and in all units.
-"""
+"""Features: named scalars and vectors of fluid particles and wall points, computed from frames and windows."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -10,18 +6,19 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from cconv.batching import counts_of
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.data.window import Window
 from cconv.domain import Box
-from cconv.errors import ShapeError
 from cconv.neighbors import Edges, radius_graph
-from cconv.nn.kinds import Kinds, join_kinds, split_kinds
+from cconv.nn.kinds import Kinds
 from cconv.sph.kernels import AbstractKernel
 from cconv.sph.operators import density, velocity_gradient
+from cconv.tasks.inputs import Features, Inputs, Units, spread_densities, units_of
 
 CONSTANT, DENSITY, PARTICLE_TYPE, NORMAL = "one", "density", "particle_type", "normal"  # names of features
 ACCELERATIONS, FORCE, VELOCITY = "accelerations", "force", "velocity"
@@ -29,111 +26,14 @@ PRESSURE_SOURCE, WALL_DISTANCE, WALL_NORMAL = "pressure_source", "wall_distance"
 WALLS = "walls"  # stands among the features of a task for those of the wall points
 
 
-@dataclass(frozen=True, kw_only=True)
-class Units:
-    """What a network's numbers are multiples of, in the units of the data.
-
-    Attributes:
-        length: Particle spacing dx.
-        density: Rest density, mean mass of a fluid particle / dx^D.
-        time: Time between stored frames.
-    """
-
-    length: float
-    density: float
-    time: float
-
-    @property
-    def velocity(self) -> float:
-        """Spacings in a frame's time."""
-        return self.length / self.time
-
-    @property
-    def acceleration(self) -> float:
-        """Spacings in a frame's time, squared."""
-        return self.length / self.time**2
-
-
-def units_of(masses: Float[Tensor, " N"], scene: Scene) -> Units:
-    """Units of a frame whose fluid particles have masses (N,)."""
-    mean_mass = float(masses.double().mean()) if len(masses) else 1.0
-    return Units(
-        length=scene.particle_spacing, density=mean_mass / scene.particle_spacing**scene.dim, time=scene.frame_dt
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Features:
-    """Named values of particles; scalars come first, everywhere.
-
-    Attributes:
-        scalars: (N, S).
-        vectors: (N, V, D).
-        scalar_names: Names of the scalars, S.
-        vector_names: Names of the vectors, V; those of one feature, e.g. of a history, share its name.
-    """
-
-    scalars: Float[Tensor, "N S"]
-    vectors: Float[Tensor, "N V D"]
-    scalar_names: tuple[str, ...]
-    vector_names: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the scalars, then of the vectors."""
-        return self.scalar_names + self.vector_names
-
-    @property
-    def kinds(self) -> Kinds:
-        """Numbers of scalars and vectors."""
-        return Kinds(len(self.scalar_names), len(self.vector_names))
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Name of the scalar or vector that each column of `flat` belongs to, S + V · D."""
-        dim = self.vectors.shape[2]
-        return self.scalar_names + tuple(name for name in self.vector_names for _ in range(dim))
-
-    def flat(self) -> Float[Tensor, "N C"]:
-        """Scalars and the components of the vectors, (N, S + V · D)."""
-        return join_kinds(self.scalars, self.vectors)
-
-    def with_values(self, flat: Float[Tensor, "M C"]) -> "Features":
-        """Features of the same names with other values, in the order of `flat`, (M, S + V · D)."""
-        scalars, vectors = split_kinds(flat, self.kinds, self.vectors.shape[2])
-        return replace(self, scalars=scalars, vectors=vectors)
-
-    def named(self, name: str) -> Float[Tensor, "N ..."]:
-        """Return the first scalar (N,) or vector (N, D) of a name."""
-        if name in self.scalar_names:
-            return self.scalars[:, self.scalar_names.index(name)]
-        return self.vectors[:, self.vector_names.index(name)]
-
-    def select(self, names: Collection[str]) -> "Features":
-        """Those of some names, in their own order.
-
-        Raises:
-            ShapeError: If one is not among them.
-        """
-        missing = [name for name in names if name not in self.names]
-        if missing:
-            raise ShapeError(
-                f"The model takes the feature {missing[0]!r}, and the inputs hold {', '.join(self.names)}."
-            )
-        if set(names) == set(self.names):
-            return self
-        scalars = [place for place, name in enumerate(self.scalar_names) if name in names]
-        vectors = [place for place, name in enumerate(self.vector_names) if name in names]
-        return Features(
-            scalars=self.scalars[:, scalars],
-            vectors=self.vectors[:, vectors],
-            scalar_names=tuple(self.scalar_names[place] for place in scalars),
-            vector_names=tuple(self.vector_names[place] for place in vectors),
-        )
-
-    def to(self, dtype: torch.dtype) -> "Features":
-        """The same in another type of numbers."""
-        return replace(self, scalars=self.scalars.to(dtype), vectors=self.vectors.to(dtype))
+def units_of_windows(state: "FluidState", scene: Scene) -> Units:
+    """Units of a state, in which each of several windows has a density of its own."""
+    if state.batch_index is None or state.fluid_batch_index is None:
+        return units_of(state.fluid_masses, scene)
+    counts = counts_of(state.batch_index)
+    fluid = counts_of(state.fluid_batch_index, len(counts))
+    units = [units_of(masses, scene) for masses in state.fluid_masses.split(fluid)]
+    return replace(units[0], density=spread_densities(units, counts))
 
 
 def features_in(names: Sequence[str], history: int) -> tuple[str, ...]:
@@ -148,62 +48,6 @@ def kinds_of(names: Sequence[str], history: int = 1) -> Kinds:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """The particles of a frame as a network sees them, in `units`.
-
-    Attributes:
-        positions: (N, D), particle spacings.
-        features: Features of each particle; the first scalar is a constant.
-        wall_positions: (B, D), particle spacings, or None where the scene has no walls.
-        wall_features: Normals, or a constant where the data hold none; None without walls.
-        box: Bounds and periodic axes, particle spacings.
-        units: What these numbers are multiples of.
-        answered: Which particles the network has to answer for, (N,), bool: the fluid; None for all.
-        known: What a predictor has answered for them already, (M, D), in the units of the data: the network has to
-            answer what remains. None without a predictor.
-    """
-
-    positions: Float[Tensor, "N D"]
-    features: Features
-    wall_positions: Float[Tensor, "B D"] | None
-    wall_features: Features | None
-    box: Box
-    units: Units
-    answered: Bool[Tensor, " N"] | None = None
-    known: Float[Tensor, "M D"] | None = None
-
-    @property
-    def num_particles(self) -> int:
-        """Number of particles N."""
-        return len(self.positions)
-
-    @property
-    def num_answers(self) -> int:
-        """Number of particles that the network has to answer for, M."""
-        return self.num_particles if self.answered is None else int(self.answered.sum())
-
-    @property
-    def dim(self) -> int:
-        """Number of space dimensions D."""
-        return self.positions.shape[1]
-
-    @property
-    def wall_kinds(self) -> Kinds | None:
-        """What a wall point carries; None without walls."""
-        return None if self.wall_features is None else self.wall_features.kinds
-
-    def double(self) -> "Inputs":
-        """The same in float64."""
-        return replace(
-            self,
-            positions=self.positions.double(),
-            features=self.features.to(torch.float64),
-            wall_positions=None if self.wall_positions is None else self.wall_positions.double(),
-            wall_features=None if self.wall_features is None else self.wall_features.to(torch.float64),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
 class FluidState:
     """Fluid particles of a frame in float64, as analytic SPH sees them.
 
@@ -213,6 +57,7 @@ class FluidState:
         masses: (N,).
         box: Bounds and periodic axes.
         kernel: SPH kernel of densities and fields.
+        batch_index: Window that each particle belongs to, (N,), ascending, if there are several; None for one.
     """
 
     positions: Float[Tensor, "N D"]
@@ -220,16 +65,22 @@ class FluidState:
     masses: Float[Tensor, " N"]
     box: Box | None
     kernel: AbstractKernel
+    batch_index: Int[Tensor, " N"] | None = None
 
     @property
     def fluid_masses(self) -> Float[Tensor, " M"]:
         """Masses of the fluid particles (M,)."""
         return self.masses
 
+    @property
+    def fluid_batch_index(self) -> Int[Tensor, " M"] | None:
+        """Window that each fluid particle belongs to (M,)."""
+        return self.batch_index
+
     @cached_property
     def edges(self) -> Edges:
         """Pairs within the kernel's support."""
-        return radius_graph(self.positions, self.kernel.support_radius, self.box)
+        return radius_graph(self.positions, self.kernel.support_radius, self.box, batch_index=self.batch_index)
 
     @cached_property
     def densities(self) -> Float[Tensor, " N"]:
@@ -261,17 +112,24 @@ class WindowState(FluidState):
         is_fluid: Which particles are fluid, (N,), bool.
         wall_points: Points that represent the walls now (B, D); none in a scene without walls.
         forces: External acceleration at each particle (N, D), 0 in a scene without a force.
+        wall_batch_index: Window that each wall point belongs to, (B,), if there are several; None for one.
     """
 
     accelerations: Float[Tensor, "N K D"]
     is_fluid: Bool[Tensor, " N"]
     wall_points: Float[Tensor, "B D"]
     forces: Float[Tensor, "N D"]
+    wall_batch_index: Int[Tensor, " B"] | None = None
 
     @property
     def fluid_masses(self) -> Float[Tensor, " M"]:
         """Masses of the fluid particles (M,)."""
         return self.masses[self.is_fluid]
+
+    @property
+    def fluid_batch_index(self) -> Int[Tensor, " M"] | None:
+        """Window that each fluid particle belongs to (M,)."""
+        return None if self.batch_index is None else self.batch_index[self.is_fluid]
 
     @property
     def pressure_sources(self) -> Float[Tensor, " N"]:
@@ -288,8 +146,14 @@ class WindowState(FluidState):
     @cached_property
     def wall_edges(self) -> Edges:
         """Wall points within the kernel's support of the fluid particles, which are counted among themselves."""
-        fluid = self.positions[self.is_fluid]
-        return radius_graph(self.wall_points, self.kernel.support_radius, self.box, queries=fluid)
+        return radius_graph(
+            self.wall_points,
+            self.kernel.support_radius,
+            self.box,
+            queries=self.positions[self.is_fluid],
+            batch_index=self.wall_batch_index,
+            query_batch_index=self.fluid_batch_index,
+        )
 
     @cached_property
     def wall_distances(self) -> Float[Tensor, " N"]:
@@ -334,7 +198,8 @@ def window_state(
         ShapeError: If the window has fewer frames.
     """
     velocities = window.displacements(scene.box, history) / scene.frame_dt
-    positions = window.present.double()
+    positions, index = window.present.double(), window.batch_index
+    of_solids = None if index is None else index[~window.is_fluid]
     return WindowState(
         positions=positions,
         velocities=velocities[-1],
@@ -345,13 +210,15 @@ def window_state(
         is_fluid=window.is_fluid,
         wall_points=positions[~window.is_fluid] if boundary is None else boundary.positions.double(),
         forces=torch.zeros_like(positions) if scene.force is None else scene.force(positions),
+        batch_index=index,
+        wall_batch_index=of_solids if boundary is None else boundary.batch_index,
     )
 
 
 # The velocity is the last of the vectors: networks that know it only as differences leave out the last.
 _SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
     CONSTANT: lambda state, units: torch.ones_like(state.masses),
-    DENSITY: lambda state, units: state.densities / units.density,
+    DENSITY: lambda state, units: (state.densities[:, None] / units.density)[:, 0],
     PRESSURE_SOURCE: lambda state, units: state.pressure_sources * units.time**2,
     PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
     WALL_DISTANCE: lambda state, units: state.wall_distances,
@@ -373,7 +240,7 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
         scene: Scene of the frame.
         names: Features of the particles; no sum over neighbours is taken for those that are not named.
     """
-    units = units_of(state.fluid_masses, scene)
+    units = units_of_windows(state, scene)
     lower, upper = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
     return Inputs(
         positions=(state.positions / units.length).float(),
@@ -382,6 +249,8 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
         wall_features=None if boundary is None else _wall_features(boundary),
         box=Box(lower, upper, scene.box.periodic),
         units=units,
+        batch_index=state.batch_index,
+        wall_batch_index=None if boundary is None else boundary.batch_index,
     )
 
 

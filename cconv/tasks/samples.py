@@ -6,14 +6,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cconv.batching import groups_of
 from cconv.data.dataset import Dataset
 from cconv.data.trajectory import Frame, Scene
-from cconv.data.window import Window, Windows
+from cconv.data.window import Origin, Window, Windows
 from cconv.errors import check_choice
-from cconv.tasks.features import Inputs, make_inputs
+from cconv.tasks.features import make_inputs
+from cconv.tasks.inputs import Inputs, join_inputs
 from cconv.tasks.task import FieldTask, StepTask, Task, as_field
 
 MOST_SPREAD = 100
@@ -22,26 +25,33 @@ HORIZON = 20  # frames of the rollouts that models are compared by, unless anoth
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """One frame to learn from.
+    """One frame to learn from, or several in one graph.
 
     Attributes:
-        trajectory: Name of its trajectory.
-        frame: Index of the frame in the stored trajectory.
+        trajectory: Name of its trajectory, of the first frame if there are several.
+        frame: Index of the frame in the stored trajectory, of the first if there are several.
         inputs: What the network is given.
         target: Answer (M, C) for the fluid particles, float32, in `target_unit`, as networks predict it.
         target_unit: What it is a multiple of, in the units of the data.
+        joined: Where each of several frames comes from; empty for one.
     """
 
     trajectory: str
     frame: int
     inputs: Inputs
     target: Float[Tensor, "M C"]
-    target_unit: float
+    target_unit: float | Tensor
+    joined: tuple[Origin, ...] = ()
+
+    @property
+    def origins(self) -> tuple[Origin, ...]:
+        """Where the frame comes from, or each of several."""
+        return self.joined or (Origin(self.trajectory, self.frame),)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepSample(Sample):
-    """One window to learn a step from, or to begin a rollout with.
+    """One window, or several that are joined, to learn a step from, or to begin a rollout with.
 
     Attributes:
         window: Its frames, and those that follow as far as they are known.
@@ -91,6 +101,30 @@ def make_step_sample(window: Window, scene: Scene, task: StepTask, names: Collec
         window=window,
         scene=scene,
         task=task,
+        joined=window.joined,
+    )
+
+
+def join_samples(samples: Sequence[Sample]) -> list[Sample]:
+    """Samples of frames in as few graphs as are sensible: alike, and with not too many particles together."""
+    counts = [sample.inputs.num_particles for sample in samples]
+    groups = groups_of(counts, [(sample.inputs.box, sample.inputs.wall_kinds) for sample in samples])
+    return [_joined_sample([samples[number] for number in group]) for group in groups]
+
+
+def _joined_sample(samples: Sequence[Sample]) -> Sample:
+    """Sample of frames, at least one, in one graph."""
+    if len(samples) == 1:
+        return samples[0]
+    first, inputs = samples[0], join_inputs([sample.inputs for sample in samples])
+    units = [torch.full_like(sample.target[:, :1], float(sample.target_unit)) for sample in samples]
+    return Sample(
+        trajectory=first.trajectory,
+        frame=first.frame,
+        inputs=inputs,
+        target=torch.cat([sample.target for sample in samples]),
+        target_unit=torch.cat(units),
+        joined=tuple(origin for sample in samples for origin in sample.origins),
     )
 
 

@@ -21,13 +21,12 @@ from cconv.tasks.features import (
     VELOCITY,
     WALLS,
     FluidState,
-    Inputs,
-    Units,
     fluid_state,
     kinds_of,
     make_inputs,
     window_state,
 )
+from cconv.tasks.inputs import Inputs, Units
 from cconv.tasks.integrators import Integrator
 
 
@@ -56,8 +55,8 @@ class Task(ABC):
     history: int = 1
 
     @abstractmethod
-    def unit(self, units: Units) -> float:
-        """What networks predict multiples of, in the units of the data."""
+    def unit(self, units: Units) -> float | Tensor:
+        """What networks predict multiples of, in the units of the data; of several windows perhaps (N, 1)."""
 
     @abstractmethod
     def inputs(self, observed: Any, scene: Scene, names: Collection[str]) -> Inputs:

@@ -1,14 +1,15 @@
 """Examples: what a training learns from, sample by sample."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
 
+from cconv.data.window import Window, join_windows, joinable
 from cconv.models.model import Model
-from cconv.tasks.samples import Sample, WindowSamples, make_step_sample
+from cconv.tasks.samples import Sample, WindowSamples, join_samples, make_step_sample
 from cconv.training.augmentation import Augmentation
 from cconv.training.unroll import Pushforward, pushed
 
@@ -19,8 +20,15 @@ class Examples(Protocol):
     def __len__(self) -> int:
         """Number of samples of an epoch."""
 
-    def draw(self, index: int, update: int, model: Model) -> Sample:
-        """Return one of them, as it is seen in an update of a model."""
+    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+        """Return some of them, as they are seen in an update of a model, in as few graphs as are sensible.
+
+        Args:
+            indices: Indices of the samples.
+            update: Number of the update.
+            model: The model.
+            steps: Steps that are learned at once; as many following frames are known, where they are stored.
+        """
 
 
 @dataclass(frozen=True)
@@ -36,9 +44,11 @@ class StoredExamples:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def draw(self, index: int, update: int, model: Model) -> Sample:
-        """Return a sample."""
-        return self.samples[index]
+    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+        """Return samples; arguments as of `Examples.draw`."""
+        if isinstance(self.samples, WindowSamples):
+            return _step_samples([self.samples.window(index) for index in indices], self.samples, model, steps)
+        return join_samples([self.samples[index] for index in indices])
 
 
 @dataclass(frozen=True)
@@ -60,12 +70,22 @@ class AugmentedExamples:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def draw(self, index: int, update: int, model: Model) -> Sample:
-        """Return the sample of a window that was changed for this update."""
+    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+        """Return samples of windows that were changed for this update; arguments as of `Examples.draw`."""
+        scene, changed = self.samples.scene, [self._changed(index, update) for index in indices]
+        windows = pushed(model, [window for window, _ in changed], scene, [count for _, count in changed])
+        return _step_samples(windows, self.samples, model, steps)
+
+    def _changed(self, index: int, update: int) -> tuple[Window, int]:
+        """A window that was changed for an update, and how many steps it is to be pushed."""
         state = np.random.SeedSequence([self.seed, update, index]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state[0] >> 1))
-        scene = self.samples.scene
-        window = self.augmentation(self.samples.window(index), scene, generator)
-        steps = min(self.pushforward.steps(update, generator), len(window.future) - 1)
-        window = pushed(model, window, scene, steps)
-        return make_step_sample(window, scene, self.samples.task, model.config.features)
+        window = self.augmentation(self.samples.window(index), self.samples.scene, generator)
+        return window, min(self.pushforward.steps(update, generator), len(window.future) - 1)
+
+
+def _step_samples(windows: Sequence[Window], of: WindowSamples, model: Model, steps: int) -> list[Sample]:
+    """Samples of windows in as few graphs as are sensible; no frame is known beyond the steps that are learned."""
+    known = [replace(window, future=window.future[:steps]) for window in windows]
+    joined = (join_windows([known[number] for number in group]) for group in joinable(known))
+    return [make_step_sample(window, of.scene, of.task, model.config.features) for window in joined]

@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from itertools import islice
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from cconv.errors import check_choice
-from cconv.models.model import Model
+from cconv.models.model import FrameGeometry, Model
 from cconv.tasks.samples import Sample
 from cconv.training.averages import begin_average, update_average
 from cconv.training.batches import batches
 from cconv.training.examples import Examples
 from cconv.training.geometry_cache import GeometryCache
-from cconv.training.losses import LOSSES, loss_of
+from cconv.training.losses import LOSSES, FrameWeight, loss_of
 from cconv.training.progress import Progress, begin
 from cconv.training.unroll import unrolled
 
@@ -126,8 +128,9 @@ def train(
     for update, indices in enumerate(order, start=progress.updates + 1):
         rate = optimization.rate_at(update)
         progress.optimizer.param_groups[0]["lr"] = rate
-        batch = [examples.draw(index, update, model) for index in indices]
-        loss = _update(model, batch, progress.optimizer, geometry, optimization.loss, optimization.steps_at(update))
+        steps = optimization.steps_at(update)
+        batch = examples.draw(indices, update, model, steps)
+        loss = _update(model, batch, progress.optimizer, geometry, LOSSES[optimization.loss], steps)
         if progress.average is not None:
             update_average(progress.average, model, optimization.average, update)
         valid = None
@@ -153,17 +156,35 @@ def _update(
     batch: Sequence[Sample],
     optimizer: torch.optim.Optimizer,
     geometry: GeometryCache,
-    loss_name: str,
+    weight: FrameWeight,
     steps: int,
 ) -> float:
-    """Take one step on the mean loss of a batch, frame by frame, so that memory does not grow with the batch."""
+    """Take one step on the mean loss of a batch, graph by graph, so that memory does not grow with the batch."""
     optimizer.zero_grad()
-    total = 0.0
+    frames, total = sum(len(sample.origins) for sample in batch), 0.0
     for sample in batch:
-        losses = [loss_of(*each, LOSSES[loss_name]) for each in unrolled(model, sample, steps, geometry)]
-        loss = torch.stack(losses).mean() / len(batch)
+        loss = torch.stack(losses_of(model, sample, geometry, weight, steps)).sum() / frames
         loss.backward()
         total += loss.item()
     if math.isfinite(total):
         optimizer.step()
     return total
+
+
+def losses_of(
+    model: Model, sample: Sample, geometry: Callable[[Sample], FrameGeometry], weight: FrameWeight, steps: int
+) -> list[Float[Tensor, ""]]:
+    """Loss of each frame of a sample, the mean over its steps.
+
+    Args:
+        model: The model.
+        sample: One frame, or several in one graph.
+        geometry: Function from a sample to its geometry, e.g. a cache.
+        weight: How much a frame counts, by its own target.
+        steps: Steps that are learned at once, of the model's own rollout.
+    """
+    losses: list[list[Tensor]] = [[] for _ in sample.origins]
+    for answers in unrolled(model, sample, steps, geometry):
+        for window, prediction, target in answers:
+            losses[window].append(loss_of(prediction, target, weight))
+    return [torch.stack(each).mean() for each in losses]

@@ -1,16 +1,16 @@
 """Unrolling: a model learns from states that its own rollout leads to."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from cconv.data.trajectory import Scene
-from cconv.data.window import Window
+from cconv.data.window import Window, join_windows, joinable
 from cconv.models.model import FrameGeometry, Model
-from cconv.rollout.rollout import Diverged, StepModel, advance, rollout
+from cconv.rollout.rollout import StepModel, begun, followed
 from cconv.tasks.samples import Sample, StepSample, make_step_sample
 
 
@@ -35,51 +35,85 @@ class Pushforward:
 
 
 @torch.no_grad()
-def pushed(model: StepModel, window: Window, scene: Scene, steps: int) -> Window:
-    """The window that a rollout of some steps leads to, or as far as it comes before it diverges."""
-    try:
-        for following in islice(rollout(model, window, scene), steps):
-            window = following
-    except Diverged:
-        pass
-    return window
+def pushed(model: StepModel, windows: Sequence[Window], scene: Scene, steps: Sequence[int]) -> list[Window]:
+    """The windows that rollouts of some steps each lead to, or as far as they come before they diverge.
+
+    Args:
+        model: The model.
+        windows: Where the rollouts begin.
+        scene: Their scene.
+        steps: Steps of each.
+    """
+    windows, left = list(windows), list(steps)
+    while moving := [number for number, count in enumerate(left) if count > 0]:
+        for group in joinable([windows[number] for number in moving]):
+            numbers = [moving[place] for place in group]
+            together = begun(join_windows([windows[number] for number in numbers]))
+            following, ends = followed(model.predict_frame, model.task.integrator, together, scene)
+            for number, window, end in zip(numbers, following.separated(), ends, strict=True):
+                left[number] = left[number] - 1 if end is None else 0
+                windows[number] = window if end is None else windows[number]
+    return windows
+
+
+class Answered(NamedTuple):
+    """What a model has answered about a window in a step of an unrolled rollout.
+
+    Attributes:
+        window: Number of the window, among several in one graph.
+        prediction: Standardised prediction (M, C).
+        target: Standardised target (M, C).
+    """
+
+    window: int
+    prediction: Tensor
+    target: Tensor
 
 
 def unrolled(
     model: Model, sample: Sample, steps: int, geometry: Callable[[Sample], FrameGeometry]
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield standardised prediction and target (M, C) of consecutive steps of the model's own rollout from a sample.
+) -> Iterator[list[Answered]]:
+    """Yield what a model answers in consecutive steps of its own rollout from a sample, about each of its windows.
 
     Gradients flow back through the steps, by way of the positions: the target of a later step is what would lead to the
-    stored frame from where the model has come, so that its error is that of the rollout's positions. The rollout ends
-    early where it diverges, or where no frame is stored to compare with. Source: Ummenhofer et al., "Lagrangian Fluid
-    Simulation with Continuous Convolutions" (ICLR 2020), whose loss has two steps.
+    stored frame from where the model has come, so that its error is that of the rollout's positions. The rollout of a
+    window ends early where it diverges, or where no frame is stored to compare with. Source: Ummenhofer et al.,
+    "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020), whose loss has two steps.
 
     Args:
         model: The model.
-        sample: Where the rollout begins; of a step task if there is more than one step.
+        sample: Where the rollouts begin; of a step task if there is more than one step.
         steps: Number of steps.
         geometry: Function from a sample to its geometry, e.g. a cache.
     """
+    numbers = list(range(len(sample.origins)))
     prediction = model(sample.inputs, geometry(sample))
-    yield prediction, model.standardize_target(sample.target)
+    yield _answers(model, sample, prediction, numbers)
     for _ in range(steps - 1):
         following = _followed(model, sample, prediction)
         if following is None:
             return
-        sample = following
+        sample, kept = following
+        numbers = [number for number, keep in zip(numbers, kept, strict=True) if keep]
         prediction = model(sample.inputs, model.geometry(sample.inputs))
-        yield prediction, model.standardize_target(sample.target)
+        yield _answers(model, sample, prediction, numbers)
 
 
-def _followed(model: Model, sample: Sample, prediction: Tensor) -> StepSample | None:
-    """The sample that a standardised prediction leads to; None if there is none."""
+def _answers(model: Model, sample: Sample, prediction: Tensor, numbers: Sequence[int]) -> list[Answered]:
+    """Answers about windows with some numbers."""
+    counts = sample.inputs.answer_counts
+    parts = prediction.split(counts), model.standardize_target(sample.target).split(counts)
+    return [Answered(*each) for each in zip(numbers, *parts, strict=True)]
+
+
+def _followed(model: Model, sample: Sample, prediction: Tensor) -> tuple[StepSample, list[bool]] | None:
+    """The sample that a standardised prediction leads to, and which of its windows are left; None if there is none."""
     if not isinstance(sample, StepSample) or len(sample.window.future) < 2:
         return None
     answer = model.in_units_of_data(prediction, sample.inputs)
-    path = advance(lambda window, scene: answer, sample.task.integrator, sample.window, sample.scene)
-    try:
-        window = next(path)
-    except Diverged:
+    start = begun(sample.window)
+    window, ends = followed(lambda window, scene: answer, sample.task.integrator, start, sample.scene)
+    kept = [end is None for end in ends]
+    if not any(kept):
         return None
-    return make_step_sample(window, sample.scene, sample.task, model.config.features)
+    return make_step_sample(window.only(kept), sample.scene, sample.task, model.config.features), kept

@@ -1,10 +1,13 @@
 """Windows cut from trajectories."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from systems import periodic_trajectory
+from systems import periodic_frame, periodic_trajectory, window_of, with_walls
 
-from cconv.data.window import Windows, window_at
+from cconv.batching import index_of
+from cconv.data.window import Windows, join_windows, joinable, window_at
 from cconv.errors import DataError
 
 
@@ -41,3 +44,54 @@ def test_a_window_beyond_the_trajectory_is_refused(present, history, future, gen
 def test_a_trajectory_that_is_too_short_is_refused_before_the_first_window(generator):
     with pytest.raises(DataError, match="4 frames, too few for a window of 6 and 1 after it"):
         Windows([periodic_trajectory(generator, num_frames=4)], 6, 1)
+
+
+def walled_windows(generator):
+    """Windows of different trajectories, whose numbers of particles and wall points differ."""
+    found = []
+    for number, name in enumerate("abc"):
+        window = window_of(with_walls(periodic_frame(generator, 5 + number)), generator, 3, 2)
+        walls = {part: getattr(window.boundary, part)[number:] for part in ("positions", "normals")}
+        boundary = replace(window.boundary, **walls)
+        found.append(replace(window, trajectory=name, frame=10 * number, boundary=boundary))
+    return found
+
+
+def assert_same(ours, theirs):
+    assert ours.origins == theirs.origins
+    for name in ("positions", "future", "masses", "particle_types", "batch_index"):
+        found, expected = getattr(ours, name), getattr(theirs, name)
+        assert found is expected is None or torch.equal(found, expected)
+    for name in ("positions", "normals"):
+        assert torch.equal(getattr(ours.boundary, name), getattr(theirs.boundary, name))
+
+
+def test_windows_that_are_joined_are_separated_again_also_a_frame_later(generator):
+    windows = walled_windows(generator)
+    joined = join_windows(windows)
+    assert torch.equal(joined.batch_index, index_of([25, 36, 49]))
+    assert torch.equal(joined.boundary.batch_index, index_of([8, 7, 6]))
+    later = joined.followed_by(joined.future[0])
+    for window, same, following in zip(windows, joined.separated(), later.separated(), strict=True):
+        assert_same(same, window)
+        assert_same(following, window.followed_by(window.future[0]))
+
+
+def test_some_of_joined_windows_are_these_joined(generator):
+    windows = walled_windows(generator)
+    joined = join_windows(windows)
+    assert_same(joined.only([True, False, True]), join_windows([windows[0], windows[2]]))
+    assert_same(joined.only([False, True, False]), windows[1])
+    assert joined.only([True] * 3) is joined
+    assert join_windows(windows[:1]) is windows[0]
+
+
+def test_windows_with_other_frames_or_walls_are_not_joined(generator):
+    first, second, third = walled_windows(generator)
+    assert joinable([first, second, third]) == [[0, 1, 2]]
+    shorter = replace(second, future=second.future[:1])
+    bare = replace(third, boundary=None)
+    without_normals = replace(third, boundary=replace(third.boundary, normals=None))
+    with_solids = replace(third, particle_types=torch.ones_like(third.particle_types))
+    others = [shorter, bare, without_normals, with_solids, replace(first, positions=first.positions.double())]
+    assert joinable([first, *others]) == [[number] for number in range(6)]

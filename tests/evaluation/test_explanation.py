@@ -10,7 +10,7 @@ from systems import configured, kernel, model_of, periodic_frame, periodic_scene
 from cconv.evaluation.explanation import error_distribution, explain, first_layer_filters
 from cconv.models.closed_form import solve_closed_form
 from cconv.tasks import task_named
-from cconv.tasks.features import Features
+from cconv.tasks.inputs import Features
 from cconv.tasks.samples import make_sample
 
 SIDE = 12

@@ -9,6 +9,7 @@ import torch
 from systems import configured, periodic_frame, periodic_scene, window_of
 
 from cconv import load_model
+from cconv.data.window import join_windows
 from cconv.errors import ConfigError
 from cconv.evaluation.cost import counted_cost
 from cconv.models.checkpoint import save_model
@@ -17,6 +18,7 @@ from cconv.rollout.rollout import advance, rollout
 from cconv.study.declared.configuration import DEFAULTS
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
+from cconv.tasks.inputs import join_inputs
 from cconv.tasks.samples import WindowSamples, make_step_sample
 
 TASK, SCENE = task_named("acceleration"), periodic_scene()
@@ -137,7 +139,18 @@ def test_a_problem_has_models_with_and_without_it(predictor, window):
     assert with_it.predictor is not None
     assert torch.equal(with_it.predictor.predict_frame(window, SCENE), predictor.predict_frame(window, SCENE))
     assert without.predictor is None
-    drawn = [given.examples(LAYER.training, 0, model.task).draw(0, 0, model) for model in (with_it, without)]
+    drawn = [given.examples(LAYER.training, 0, model.task).draw([0], 0, model)[0] for model in (with_it, without)]
     torch.testing.assert_close(
         drawn[0].inputs.known + drawn[0].target * drawn[0].target_unit, drawn[1].target * drawn[1].target_unit
     )
+
+
+def test_joined_windows_are_answered_as_each_alone(corrected, generator):
+    windows = [window_of(periodic_frame(generator), generator, future=2) for _ in range(3)]
+    answers = torch.cat([corrected.predict_frame(window, SCENE) for window in windows])
+    torch.testing.assert_close(corrected.predict_frame(join_windows(windows), SCENE), answers, rtol=1e-5, atol=1e-8)
+    joined = make_step_sample(join_windows(windows), SCENE, corrected.task)
+    apart = [make_step_sample(window, SCENE, corrected.task) for window in windows]
+    for found, one in zip(joined.inputs.separated(), apart, strict=True):
+        torch.testing.assert_close(found.known, one.inputs.known, rtol=1e-5, atol=1e-8)
+    assert torch.equal(join_inputs([one.inputs for one in apart]).known, torch.cat([one.inputs.known for one in apart]))

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from cconv.models.standardization import standardize_features, standardize_values
-from cconv.tasks.features import Features
+from cconv.tasks.inputs import Features
 
 
 def features(scalars, vectors):

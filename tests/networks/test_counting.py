@@ -91,7 +91,8 @@ def surroundings():
 
 
 def cost(network=None, **changes):
-    features, _, settings, _ = configured(**(network or {}) | changes)
+    configuration = configured(**(network or {}) | changes)
+    features, settings = configuration.features, configuration.network
     walls = Kinds(0, 1) if "walls" in features else None
     return settings.count(kinds_of(features), walls, Kinds(1, 0), 3, surroundings())
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from cconv.batching import index_of
 from cconv.errors import ConfigError
 from cconv.neighbors import radius_graph
 from cconv.networks import RadialNetSettings
@@ -30,6 +31,21 @@ def test_what_conserves_momentum_adds_up_to_nothing(layers, message, generator):
     assert predicted.sum(dim=0).abs().max() < 1e-12 * predicted.abs().sum()
     free, features = built(generator, layers=layers, message=message)
     assert free(features).sum(dim=0).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("layers", [1, 3])
+def test_momentum_is_conserved_in_each_of_several_windows(layers, generator):
+    """What one window answers does not depend on the others."""
+    settings = RadialNetSettings(layers=layers, message="mixed", conserves_momentum=True, first_channels=4)
+    network, counts = settings.build(INPUTS, None, VECTOR, 2, generator).double(), [60, 35]
+    features = torch.randn(95, INPUTS.num_values(2), generator=generator, dtype=torch.float64)
+    positions = 5 * torch.rand(95, 2, generator=generator, dtype=torch.float64)
+    cutoff = settings.relative_cutoff
+    joined = network(features, settings.geometry(radius_graph(positions, cutoff, batch_index=index_of(counts))))
+    parts = zip(features.split(counts), positions.split(counts), joined.split(counts), strict=True)
+    for values, points, predicted in parts:
+        assert predicted.sum(dim=0).abs().max() < 1e-12 * predicted.abs().sum()
+        torch.testing.assert_close(predicted, network(values, settings.geometry(radius_graph(points, cutoff))))
 
 
 @pytest.mark.parametrize("layers", [1, 3])

@@ -84,5 +84,7 @@ def test_clumps_end_it_before_their_neighbours_are_searched(generator):
 def test_the_fullest_cell_is_counted_however_far_apart_particles_are(dim, generator):
     cells = torch.randint(-2, 3, (200, dim), generator=generator)
     cells[::10] *= 2**61
-    assert _most_in_a_cell(cells) == int(cells.unique(dim=0, return_counts=True)[1].max())
-    assert _most_in_a_cell(cells[:1]) == 1
+    index = torch.arange(200) // 70  # of three windows, which do not see each other
+    expected = [int(cells[index == window].unique(dim=0, return_counts=True)[1].max()) for window in range(3)]
+    assert _most_in_a_cell(cells, index, 3) == expected
+    assert _most_in_a_cell(cells[:1], index[:1], 1) == [1]

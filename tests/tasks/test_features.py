@@ -5,7 +5,8 @@ from systems import kernel, periodic_frame, periodic_scene, with_walls
 from cconv.data.trajectory import Frame, ParticleType
 from cconv.errors import ShapeError
 from cconv.nn.kinds import Kinds
-from cconv.tasks.features import Units, fluid_state, kinds_of, make_inputs
+from cconv.tasks.features import fluid_state, kinds_of, make_inputs
+from cconv.tasks.inputs import Units
 
 NAMES = ("one", "density", "velocity")
 

@@ -32,7 +32,7 @@ def test_there_are_no_steps_before_it_begins_and_all_numbers_after(generator):
 
 def test_the_window_is_that_of_the_models_rollout_and_the_target_leads_back(samples, model):
     start = samples.windows[0]
-    window = pushed(model, start, SCENE, 2)
+    (window,) = pushed(model, [start], SCENE, [2])
     path = rollout(model, start, SCENE)
     next(path)
     assert torch.equal(window.present, next(path).present)
@@ -49,12 +49,13 @@ def test_a_rollout_that_diverges_stays_where_it_came(samples):
         def predict_frame(self, window, scene):
             return torch.full((64, 2), torch.nan)
 
-    assert torch.equal(pushed(Broken(), samples.windows[0], SCENE, 3).present, samples.windows[0].present)
+    (window,) = pushed(Broken(), [samples.windows[0]], SCENE, [3])
+    assert torch.equal(window.present, samples.windows[0].present)
 
 
 def test_examples_are_never_pushed_beyond_what_is_stored(samples, model):
     examples = AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(20, 0), seed=0)
-    frames = {examples.draw(0, update, model).frame for update in range(1, 40)}
+    frames = {sample.frame for update in range(1, 40) for sample in examples.draw([0], update, model)}
     assert frames == {5, 6, 7, 8}  # at least one frame of future is left to lead to
 
 
@@ -67,18 +68,20 @@ def equivariant(samples, generator):
 def test_examples_hold_what_the_model_takes_as_samples_with_all_features_have_it(samples, model):
     """No sum over neighbours is taken for a feature that the model does without."""
     model.config = model.config.model_copy(update={"features": ("one", "accelerations", "velocity")})
-    drawn = (
-        AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(0, 0), seed=0).draw(0, 1, model).inputs.features
-    )
+    examples = AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(0, 0), seed=0)
+    (sample,) = examples.draw([0], 1, model)
+    drawn = sample.inputs.features
     assert set(drawn.names) == {"one", "accelerations", "velocity"}
     assert torch.equal(drawn.flat(), samples[0].inputs.features.select(drawn.names).flat())
 
 
 def errors_of(model, sample, steps):
     """Root of the mean squared error of each step, in the units of the data."""
-    pairs = unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))
     unit = model.target_scale[0] * sample.target_unit
-    return [float((prediction - target).detach().square().mean().sqrt() * unit) for prediction, target in pairs]
+    return [
+        float((prediction - target).detach().square().mean().sqrt() * unit)
+        for [(_, prediction, target)] in unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))
+    ]
 
 
 def test_errors_of_unrolled_steps_are_those_of_the_rollout(samples, equivariant):
@@ -96,7 +99,7 @@ def test_gradients_of_unrolled_steps_are_those_of_finite_differences(samples, eq
     weights = next(model.parameters())
 
     def last_error():
-        *_, (prediction, target) = unrolled(model, sample, 3, lambda each: model.geometry(each.inputs))
+        *_, [(_, prediction, target)] = unrolled(model, sample, 3, lambda each: model.geometry(each.inputs))
         return (prediction - target).square().mean()
 
     (gradient,) = torch.autograd.grad(last_error(), weights)

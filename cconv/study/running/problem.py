@@ -135,7 +135,7 @@ class Problem:
         With noise, each place gives one noisy example; the loss says how much each frame counts.
         """
         examples = self.examples(training, seed, model.task)
-        drawn = (examples.draw(place, 0, model) for place in places)
+        drawn = (sample for place in places for sample in examples.draw([place], 0, model))
         solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
 
     @cached_property

@@ -36,11 +36,9 @@ def test_a_closed_form_is_fitted_to_stored_windows_however_early_pushforward_beg
     samples, config = WindowSamples([window], periodic_scene(), task), SimpleNamespace(features=task.features)
     unfitted = SimpleNamespace(task=task, predict_frame=None, config=config)
     training = TrainingConfig(pushforward=5, pushforward_from=0.0)
-    drawn = [
-        replace(problem(generator), train_samples=samples).examples(training, seed, task).draw(0, 0, unfitted)
-        for seed in range(20)
-    ]
-    assert {sample.frame for sample in drawn} == {window.frame}
+    given = replace(problem(generator), train_samples=samples)
+    drawn = [given.examples(training, seed, task).draw([0], 0, unfitted) for seed in range(20)]
+    assert {sample.frame for (sample,) in drawn} == {window.frame}
 
 
 def steps(generator, history):
@@ -70,8 +68,9 @@ def test_a_model_does_not_depend_on_the_longest_history_that_others_have(history
     assert all(torch.equal(value, known[name]) for name, value in models[0].state_dict().items())
     for training in (TrainingConfig(), TrainingConfig(noise=0.02)):
         drawn = [
-            each.examples(training, 1, model.task).draw(2, 5, model)
+            sample
             for each, model in zip((long, short), models, strict=True)
+            for sample in each.examples(training, 1, model.task).draw([2], 5, model)
         ]
         assert drawn[0].frame == drawn[1].frame
         assert torch.equal(drawn[0].inputs.features.flat(), drawn[1].inputs.features.flat())
@@ -114,7 +113,7 @@ def test_targets_are_standardised_after_the_force_was_taken_off(generator):
         torch.testing.assert_close(sample.target - other.target, added, rtol=0, atol=1e-5)
     assert without.target_scale.max() > 2 * plain.target_scale.max()
     assert (plain.config.force_travel, without.config.force_travel is None) == (None, False)
-    drawn = given.examples(TrainingConfig(noise=0.01), 1, without.task).draw(0, 1, without)
+    (drawn,) = given.examples(TrainingConfig(noise=0.01), 1, without.task).draw([0], 1, without)
     assert drawn.task == without.task
 
 
