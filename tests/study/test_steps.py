@@ -4,6 +4,7 @@ import json
 
 import pytest
 from conftest import SMOKE, run_main
+from outcomes import assert_one_clear_line
 
 from cconv.data.dataset import open_dataset
 from cconv.study.records.rollouts import read_rollouts
@@ -113,3 +114,64 @@ def test_the_frames_of_the_first_rollout_of_the_recommended_model_are_kept_and_d
     page = (run.path / "report.html").read_text()
     assert 'src="data:image/gif;base64,R0lGOD' in page
     assert '<h2 id="rollouts">' in page
+
+
+CORRECTED = """
+name = "corrected"
+[task]
+name = "acceleration"
+history = 3
+horizon = 5
+[predictor]
+noise = 0.0
+[predictor.network]
+architecture = "radial_net"
+layers = 1
+message = "mixed"
+radial_terms = 6
+relative_cutoff = 3.0
+[training]
+updates = 6
+evaluate_every = 3
+[search]
+space = "{space}"
+grace_updates = 3
+[stages.random]
+trials = 1
+[stages.finalists]
+count = 1
+include.alone = {{ task.with_predictor = false }}
+[stages.select]
+[finalists]
+seeds = 2
+[cost]
+repeats = 3
+trials = 0
+sizes = [100, 200]
+"""
+
+
+def test_a_study_fits_its_predictor_once_and_compares_networks_with_and_without_it(steps_folder, cconv, tmp_path):
+    space = SMOKE.parents[1] / "search_spaces" / "rollout_corrected.toml"
+    (tmp_path / "study.toml").write_text(CORRECTED.format(space=space))
+    given = ("--serial", "--data", steps_folder, "--out", tmp_path / "run")
+    assert cconv("study", "run", tmp_path / "study.toml", *given)[0] == 0
+    run = RunFolder.open(tmp_path / "run")
+    fitted = (run.path / "predictor" / "model.safetensors").read_bytes()
+    has_predictor = {
+        entry.id: json.loads((run.path / entry.checkpoint / "config.json").read_text())["predictor"] is not None
+        for entry in run.summary().finalists
+    }
+    assert (has_predictor["baseline"], has_predictor["alone"]) == (True, False)
+    run.forget_result("select")
+    assert cconv("study", "resume", run.path, "--serial")[0] == 0
+    assert (run.path / "predictor" / "model.safetensors").read_bytes() == fitted
+
+
+def test_a_space_whose_networks_look_back_less_far_than_the_predictor_is_refused(steps_folder, cconv, tmp_path):
+    space = SMOKE.parents[1] / "search_spaces" / "rollout.toml"
+    (tmp_path / "study.toml").write_text(CORRECTED.format(space=space))
+    given = ("--serial", "--data", steps_folder, "--out", tmp_path / "run")
+    outcome = cconv("study", "run", tmp_path / "study.toml", *given)
+    assert_one_clear_line(outcome, "task.history: must be at least 3, that of the predictor, got 2")
+    assert not (tmp_path / "run").exists()
