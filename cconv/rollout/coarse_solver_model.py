@@ -10,7 +10,7 @@ from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 from cconv.errors import SimulationError
 from cconv.rollout.rollout import Diverged
-from cconv.rollout.solver_model import has_reached
+from cconv.rollout.solver_model import check_alone, has_reached
 from cconv.scenes.coarse import coarse_state, velocities_at
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.sph.solver import ParticleState
@@ -41,7 +41,9 @@ class CoarseSolverModel:
 
         Raises:
             Diverged: If a simulation blows up.
+            ShapeError: If several windows are joined.
         """
+        check_alone(frame)
         fluid = frame.is_fluid
         try:
             if self._state is None or not has_reached(self._reached, frame, scene):

@@ -8,7 +8,7 @@ from torch import Tensor
 from cconv.data.restart import solved_frames
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
-from cconv.errors import SimulationError
+from cconv.errors import ShapeError, SimulationError
 from cconv.rollout.rollout import Diverged
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.tasks.task import StepTask
@@ -37,7 +37,9 @@ class SolverModel:
 
         Raises:
             Diverged: If the simulation blows up.
+            ShapeError: If several windows are joined.
         """
+        check_alone(frame)
         if not has_reached(self._reached, frame, scene):
             self._frames = solved_frames(self._simulated, frame)
         try:
@@ -46,6 +48,16 @@ class SolverModel:
             self._reached = None
             raise Diverged(frame.frame + 1, str(error).removesuffix(".")) from error
         return self.task.target(replace(frame, future=self._reached.present[None]), scene)
+
+
+def check_alone(window: Window) -> None:
+    """Check that a solver is asked about one window.
+
+    Raises:
+        ShapeError: If several are joined.
+    """
+    if window.joined:
+        raise ShapeError(f"a solver carries one window on after another, got {len(window.joined)} that are joined.")
 
 
 def has_reached(last: Window | None, frame: Window, scene: Scene) -> bool:

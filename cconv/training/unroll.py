@@ -10,6 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window, join_windows, joinable
 from cconv.models.model import FrameGeometry, Model
+from cconv.rollout.correctors import correctors_of
 from cconv.rollout.rollout import StepModel, begun, followed
 from cconv.tasks.samples import Sample, StepSample, make_step_sample
 
@@ -44,12 +45,12 @@ def pushed(model: StepModel, windows: Sequence[Window], scene: Scene, steps: Seq
         scene: Their scene.
         steps: Steps of each.
     """
-    windows, left = list(windows), list(steps)
+    windows, left, correctors = list(windows), list(steps), correctors_of(model)
     while moving := [number for number, count in enumerate(left) if count > 0]:
         for group in joinable([windows[number] for number in moving]):
             numbers = [moving[place] for place in group]
             together = begun(join_windows([windows[number] for number in numbers]))
-            following, ends = followed(model.predict_frame, model.task.integrator, together, scene)
+            following, ends = followed(model.predict_frame, model.task.integrator, together, scene, correctors)
             for number, window, end in zip(numbers, following.separated(), ends, strict=True):
                 left[number] = left[number] - 1 if end is None else 0
                 windows[number] = window if end is None else windows[number]

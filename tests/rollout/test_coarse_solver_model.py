@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from cconv.data.trajectory import Scene
-from cconv.data.window import Window
+from cconv.data.window import Window, join_windows
+from cconv.errors import ShapeError
 from cconv.evaluation.rollout_errors import rollout_errors
 from cconv.evaluation.solver_comparison import compared_rollouts, mean_error, measure_solvers
 from cconv.rollout.coarse_solver_model import CoarseSolverModel
@@ -96,3 +97,10 @@ def test_the_error_of_models_is_the_mean_over_them_and_over_the_rollouts(simulat
     model = SolverModel(simulated, TASK)
     error = rollout_errors(model.predict_frame, sample).error
     assert mean_error([model, model], [sample, sample]) == pytest.approx(error)
+
+
+def test_solvers_refuse_windows_that_are_joined(simulated, sample):
+    joined = join_windows([sample.window, sample.window])
+    for solver in (SolverModel(simulated, TASK), CoarseSolverModel(simulated, coarser(simulated, 2), TASK)):
+        with pytest.raises(ShapeError, match="one window on after another, got 2"):
+            solver.predict_frame(joined, sample.scene)
