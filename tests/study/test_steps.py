@@ -3,9 +3,11 @@
 import json
 
 import pytest
+import torch
 from conftest import SMOKE, run_main
 from outcomes import assert_one_clear_line
 
+from cconv import load_model
 from cconv.data.dataset import open_dataset
 from cconv.study.records.rollouts import read_rollouts
 from cconv.study.records.run_folder import RunFolder
@@ -136,36 +138,25 @@ evaluate_every = 3
 [search]
 space = "{space}"
 grace_updates = 3
-[stages.random]
-trials = 1
-[stages.finalists]
-count = 1
-include.alone = {{ task.with_predictor = false }}
-[stages.select]
-[finalists]
-seeds = 2
-[cost]
-repeats = 3
-trials = 0
-sizes = [100, 200]
+[stages.baseline]
 """
 
 
-def test_a_study_fits_its_predictor_once_and_compares_networks_with_and_without_it(steps_folder, cconv, tmp_path):
+def test_a_study_fits_its_predictor_once_and_its_networks_correct_it(steps_folder, cconv, tmp_path):
     space = SMOKE.parents[1] / "search_spaces" / "rollout_corrected.toml"
     (tmp_path / "study.toml").write_text(CORRECTED.format(space=space))
     given = ("--serial", "--data", steps_folder, "--out", tmp_path / "run")
     assert cconv("study", "run", tmp_path / "study.toml", *given)[0] == 0
     run = RunFolder.open(tmp_path / "run")
-    fitted = (run.path / "predictor" / "model.safetensors").read_bytes()
-    has_predictor = {
-        entry.id: json.loads((run.path / entry.checkpoint / "config.json").read_text())["predictor"] is not None
-        for entry in run.summary().finalists
-    }
-    assert (has_predictor["baseline"], has_predictor["alone"]) == (True, False)
-    run.forget_result("select")
+    predictor, (trial,) = load_model(run.path / "predictor"), run.trials()
+    assert trial.last_error is not None
+    within = load_model(run.trial(trial.id).checkpoint).predictor
+    assert all(torch.equal(value, within.state_dict()[name]) for name, value in predictor.state_dict().items())
+    files = run.path / "predictor" / "model.safetensors", run.path / "predictor" / "card.json"
+    fitted = [file.stat().st_mtime_ns for file in files]
+    run.forget_result("baseline")
     assert cconv("study", "resume", run.path, "--serial")[0] == 0
-    assert (run.path / "predictor" / "model.safetensors").read_bytes() == fitted
+    assert [file.stat().st_mtime_ns for file in files] == fitted
 
 
 def test_a_space_whose_networks_look_back_less_far_than_the_predictor_is_refused(steps_folder, cconv, tmp_path):
