@@ -18,7 +18,7 @@ from cconv.errors import ConfigError, did_you_mean, shown
 LARGEST = 1e12  # number of a declaration, in any unit
 _FARTHEST = 8.0  # standard deviations, beyond which nothing is felt of a change of sign
 
-Smoothed = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length per time squared
+Accelerating = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length per time squared
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Force(ABC):
         """Accelerations (N, D) at positions (N, D), length per time squared."""
 
     @abstractmethod
-    def smoothed(self, deviation: float) -> Smoothed:
+    def smoothed(self, deviation: float) -> Accelerating:
         """Its mean over normally distributed displacements around each position.
 
         Args:
@@ -83,7 +83,7 @@ class ConstantForce(Force):
         """The acceleration at each position."""
         return torch.tensor(self.acceleration, dtype=positions.dtype).expand_as(positions)
 
-    def smoothed(self, deviation: float) -> Smoothed:
+    def smoothed(self, deviation: float) -> Accelerating:
         """The force itself, whatever the displacements; see `Force.smoothed`."""
         return self
 
@@ -124,7 +124,7 @@ class ReversePoiseuilleForce(Force):
         accelerations[:, 0] = torch.where(upper, -self.magnitude, self.magnitude)
         return accelerations
 
-    def smoothed(self, deviation: float) -> Smoothed:
+    def smoothed(self, deviation: float) -> Accelerating:
         r"""Its mean in closed form, a sum over the places k L/2 where the sign changes; see `Force.smoothed`.
 
         .. math:: g_x = g \sum_k (-1)^k \operatorname{erf} \frac{y - k L / 2}{\sqrt 2 \sigma}

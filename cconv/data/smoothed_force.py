@@ -11,7 +11,7 @@ appendix F.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -21,9 +21,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
-from cconv.forces import ReversePoiseuilleForce
-
-Accelerating = Callable[[Tensor], Tensor]  # positions (N, D) to accelerations (N, D), length/time²
+from cconv.forces import Accelerating, ReversePoiseuilleForce
 
 _FARTHEST = 5.0  # standard deviations; beyond them lies less than 1e-6 of the weight
 

@@ -258,7 +258,7 @@ class Model(nn.Module):
     @torch.no_grad()
     def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_answers} C"]:
         """Prediction (M, C) in the units of the data that the inputs were made of."""
-        return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
+        return self._answer(inputs)
 
     def in_units_of_data(self, prediction: Float[Tensor, "M C"], inputs: Inputs) -> Float[Tensor, "M C"]:
         """Convert a standardised prediction (M, C) to the units of the data, and add what a predictor has answered."""
@@ -277,7 +277,9 @@ class Model(nn.Module):
 
     def answer(self, observed: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
         """`predict_frame`, differentiable."""
-        inputs = self.inputs(observed, scene)
+        return self._answer(self.inputs(observed, scene))
+
+    def _answer(self, inputs: Inputs) -> Float[Tensor, "M C"]:
         return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
 
     def inputs(self, frame: Frame | Window, scene: Scene) -> Inputs:

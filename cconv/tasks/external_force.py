@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from cconv.data.smoothed_force import Accelerating, evaluated
+from cconv.data.smoothed_force import evaluated
 from cconv.data.trajectory import Scene
 from cconv.data.window import Window
 from cconv.errors import ConfigError
-from cconv.forces import Force
+from cconv.forces import Accelerating, Force
 from cconv.tasks.integrators import Integrator
 
 

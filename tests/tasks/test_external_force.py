@@ -39,18 +39,23 @@ def free_fall(gravity, steps_per_frame, time_step, frames):
     return torch.stack(stored)
 
 
-def test_nothing_is_left_to_learn_of_a_free_fall(generator):
-    """The second difference over frames of M steps is (M Δt)² g to rounding, not M (M + 1)/2 Δt² g."""
-    gravity = torch.tensor([0.7, -9.81], dtype=torch.float64)
-    positions = free_fall(gravity, steps_per_frame=100, time_step=3e-4, frames=4)
-    scene = replace(SCENE, frame_dt=0.03, box=Box([0, 0], [10, 10]))
-    window = replace(
+def window_along(positions, generator):
+    """The window of two particles whose present is the third of some frames."""
+    return replace(
         window_of(periodic_frame(generator), generator),
         positions=positions[:3],
         future=positions[3:],
         masses=torch.ones(2),
         particle_types=torch.zeros(2, dtype=torch.int64),
     )
+
+
+def test_nothing_is_left_to_learn_of_a_free_fall(generator):
+    """The second difference over frames of M steps is (M Δt)² g to rounding, not M (M + 1)/2 Δt² g."""
+    gravity = torch.tensor([0.7, -9.81], dtype=torch.float64)
+    positions = free_fall(gravity, steps_per_frame=100, time_step=3e-4, frames=4)
+    scene = replace(SCENE, frame_dt=0.03, box=Box([0, 0], [10, 10]))
+    window = window_along(positions, generator)
     integrator = WithExternalForce(EULER, FORCES["constant"])
     assert integrator.target(window, scene).abs().max() < 1e-12
     after = integrator.advance(window, torch.zeros(2, 2), scene)
@@ -97,13 +102,7 @@ def test_a_network_that_answers_nothing_predicts_a_free_fall_exactly(generator):
     positions = free_fall(gravity, steps_per_frame=100, time_step=3e-4, frames=6)
     task, scene = with_force(ConstantForce((0.7, -9.81)), travel=0.3)
     scene = replace(scene, frame_dt=0.03, box=Box([0, 0], [10, 10]))
-    window = replace(
-        window_of(periodic_frame(generator), generator),
-        positions=positions[:3],
-        future=positions[3:],
-        masses=torch.ones(2),
-        particle_types=torch.zeros(2, dtype=torch.int64),
-    )
+    window = window_along(positions, generator)
     for stored in positions[3:]:
         window = task.integrator.advance(window, torch.zeros(2, 2), scene)
         torch.testing.assert_close(window.present, stored, rtol=0, atol=1e-11)

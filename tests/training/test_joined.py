@@ -77,20 +77,22 @@ def one_graph(task, frames, steps=1):
     return joined
 
 
-def assert_learned_alike(model, joined, samples, weight, steps):
+def learned(model, graphs, weight, steps):
     """Each frame's loss, and the derivative of their sum, which is that of a batch."""
-    answers = []
-    for graphs in ([joined], samples):
-        model.zero_grad()
-        losses = [
-            loss
-            for sample in graphs
-            for loss in losses_of(model, in_double(sample), lambda each: model.geometry(each.inputs), weight, steps)
-        ]
-        torch.stack(losses).sum().backward()
-        gradients = [weights.grad.clone() for weights in model.parameters() if weights.numel()]
-        answers.append((torch.stack(losses).detach(), gradients))
-    (losses, gradients), (expected, expected_gradients) = answers
+    model.zero_grad()
+    losses = [
+        loss
+        for sample in graphs
+        for loss in losses_of(model, sample, lambda each: model.geometry(each.inputs), weight, steps)
+    ]
+    torch.stack(losses).sum().backward()
+    gradients = [weights.grad.clone() for weights in model.parameters() if weights.numel()]
+    return torch.stack(losses).detach(), gradients
+
+
+def assert_learned_alike(model, joined, samples, weight, steps):
+    losses, gradients = learned(model, [in_double(joined)], weight, steps)
+    expected, expected_gradients = learned(model, map(in_double, samples), weight, steps)
     assert len(losses) == len(SIZES)
     torch.testing.assert_close(losses, expected, rtol=1e-9, atol=0)
     for found, each in zip(gradients, expected_gradients, strict=True):
@@ -119,19 +121,10 @@ def test_so_are_those_of_unrolled_steps_through_positions(walls, generator):
     samples, joined = samples_of(asked, frames), one_graph(asked, frames, 3)
     settings = configured(**NETWORKS["radial"], conserves_momentum=True)
     model = model_of(settings, SCENE, "acceleration", samples, generator)
-    answers = []
-    for graphs in ([joined], samples):
-        model.zero_grad()
-        losses = [
-            loss
-            for sample in graphs
-            for loss in losses_of(model, sample, lambda each: model.geometry(each.inputs), LOSSES["mse"], 3)
-        ]
-        torch.stack(losses).sum().backward()
-        gradients = [weights.grad.clone() for weights in model.parameters() if weights.numel()]
-        answers.append((torch.stack(losses).detach(), gradients))
-    torch.testing.assert_close(answers[0][0], answers[1][0], rtol=1e-4, atol=0)
-    for found, each in zip(answers[0][1], answers[1][1], strict=True):
+    losses, gradients = learned(model, [joined], LOSSES["mse"], 3)
+    expected, expected_gradients = learned(model, samples, LOSSES["mse"], 3)
+    torch.testing.assert_close(losses, expected, rtol=1e-4, atol=0)
+    for found, each in zip(gradients, expected_gradients, strict=True):
         torch.testing.assert_close(found, each, rtol=1e-3, atol=1e-4 * float(each.abs().max()))
 
 

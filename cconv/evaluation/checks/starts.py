@@ -10,7 +10,7 @@ from torch import Tensor
 from cconv.data.trajectory import Boundary, Scene, Trajectory
 from cconv.data.window import Window, window_at
 from cconv.domain import Box
-from cconv.forces import Force, Smoothed
+from cconv.forces import Accelerating, Force
 
 SHAKEN = 0.05  # standard deviation of the shifts along each axis, particle spacings
 SQUEEZED, SQUEEZED_WITHIN = 0.1, 4.0  # share that lengths lose at the centre of a ball, its radius in spacings
@@ -74,11 +74,11 @@ class MappedForce(Force):
         """Accelerations (N, D) at positions (N, D)."""
         return self._mapped(self.force, positions)
 
-    def smoothed(self, deviation: float) -> Smoothed:
+    def smoothed(self, deviation: float) -> Accelerating:
         """The smoothed force before the mapping, mapped; see `Force.smoothed`."""
         return partial(self._mapped, self.force.smoothed(deviation / self.mapping.factor))
 
-    def _mapped(self, force: Smoothed, positions: Tensor) -> Tensor:
+    def _mapped(self, force: Accelerating, positions: Tensor) -> Tensor:
         return self.mapping.of_vectors(force(self.mapping.inverse(positions))).to(positions.dtype)
 
 

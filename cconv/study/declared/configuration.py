@@ -38,6 +38,8 @@ HYPERPARAMETERS = (
 
 Settings = TypeVar("Settings", bound=StrictModel)
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
+Noise = Annotated[Real, Field(ge=0, le=1)]  # standard deviation of the last velocity's, particle spacings per frame
+Loss = Literal["mse", "balanced_mse"]
 
 
 class TaskConfig(StrictModel):
@@ -113,8 +115,8 @@ class TrainingConfig(StrictModel):
     batch_size: Whole = Field(1, ge=1, le=10**6)
     learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
     schedule: Literal["constant", "cosine", "exponential"] = "cosine"
-    loss: Literal["mse", "balanced_mse"] = "mse"
-    noise: Real = Field(0.0, ge=0, le=1)
+    loss: Loss = "mse"
+    noise: Noise = 0.0
     pushforward: Whole = Field(0, ge=0, le=MOST_PUSHED)
     pushforward_from: Real = Field(0.5, ge=0, le=1)
     unroll: Whole = Field(1, ge=1, le=MOST_UNROLLED)

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from pydantic import Field, field_validator, model_validator
 
@@ -15,6 +15,8 @@ from cconv.study.declared.configuration import (
     HISTORY,
     WITH_PREDICTOR,
     Configuration,
+    Loss,
+    Noise,
     TaskConfig,
     TrainingConfig,
     Updates,
@@ -75,8 +77,8 @@ class PredictorConfig(StrictModel):
     """
 
     network: NetworkTable
-    noise: Real = Field(1e-2, ge=0, le=1)
-    loss: Literal["mse", "balanced_mse"] = "balanced_mse"
+    noise: Noise = 1e-2
+    loss: Loss = "balanced_mse"
     ridge: Ridge = 1e-10
 
     @field_validator("network")

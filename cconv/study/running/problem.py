@@ -85,20 +85,20 @@ class Problem:
         return as_step(task).correcting(self.predictor)
 
     def _typical(self, task: Task) -> Sequence[Sample]:
-        samples = self._training_samples(task)
-        return samples.spread if isinstance(samples, WindowSamples) else samples
-
-    def _training_samples(self, task: Task) -> Sequence[Sample]:
-        """Training samples of models of some task; those of each are made once."""
-        if not isinstance(self.train_samples, WindowSamples):
-            return self.train_samples
-        if task not in self._of_task:
-            self._of_task[task] = self.train_samples.of_task(as_step(task))
-        return self._of_task[task]
+        """Typical training samples of models of some task; those of each are made once."""
+        if task not in self._spread:
+            samples = self._training_samples(task)
+            self._spread[task] = samples.spread if isinstance(samples, WindowSamples) else samples
+        return self._spread[task]
 
     @cached_property
-    def _of_task(self) -> dict[Task, WindowSamples]:
+    def _spread(self) -> dict[Task, Sequence[Sample]]:
         return {}
+
+    def _training_samples(self, task: Task) -> Sequence[Sample]:
+        """Training samples of models of some task."""
+        samples = self.train_samples
+        return samples.of_task(as_step(task)) if isinstance(samples, WindowSamples) else samples
 
     @cached_property
     def _travel(self) -> float:
@@ -251,12 +251,7 @@ def load_problem(
         dataset: Its data.
         task: Its task, of `study_task`.
         progress: Wraps an iterable to show progress, given a label.
-
-    Raises:
-        ConfigError: If the integrator is to add an external force where there is none.
     """
-    if study.task.external_force == BY_INTEGRATOR:
-        force_to_add(dataset.scene)
     train, valid = (study_samples(study, dataset, split, task, progress) for split in ("train", "valid"))
     return Problem(scene=dataset.scene, task=task, train_samples=train, valid_samples=valid)
 
