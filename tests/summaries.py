@@ -1,5 +1,6 @@
 """Summaries for tests of the report, with as little and with as much as a study may find. All go through the types."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,11 +100,15 @@ def whole_summary(summary: Summary) -> Summary:
     )
 
 
-def solver_comparison(*errors: float, network_error: float = 1e-4) -> SolverComparison:
-    """Solvers of these errors, the first that of the data at 8 ms, each four times as fast as the one before."""
+def solver_comparison(*errors: float, network_error: float = 1e-4, slow: Sequence[float] = ()) -> SolverComparison:
+    """Solvers of these errors, the first that of the data at 8 ms, each four times as fast as the one before.
+
+    Those with slow sound have the errors `slow` and the same times.
+    """
     points = [
         SolverPoint(
             factor=1.0 + place,
+            sound_ratio=sound_ratio,
             num_particles=400 // (1 + place) ** 2,
             steps=100 // (1 + place),
             ms_per_frame=8 / 4**place,
@@ -112,7 +117,8 @@ def solver_comparison(*errors: float, network_error: float = 1e-4) -> SolverComp
             error=error,
             diverged=0.0,
         )
-        for place, error in enumerate(errors)
+        for sound_ratio, series in ((10, errors), (5, slow))
+        for place, error in enumerate(series)
     ]
     return SolverComparison(points=points, rollouts=4, network_error=network_error)
 

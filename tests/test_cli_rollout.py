@@ -14,6 +14,7 @@ from outcomes import assert_one_clear_line
 from particle_files import record_frames, write_parts
 
 from cconv.data.dataset import open_dataset
+from cconv.data.trajectory import ParticleType
 from cconv.forces import ConstantForce
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.relaxation import Relaxation
@@ -345,6 +346,20 @@ def test_a_damaged_stored_frame_is_told_before_anything_is_predicted(
     outcome = cconv("rollout", fitted, "--data", tmp_path / "data", "--out", tmp_path / "out")
     assert_one_clear_line(outcome, "trajectory test/00000, frame 9: `position` has a NaN")
     assert [file.name for file in tmp_path.iterdir()] == ["data"]
+
+
+def test_data_without_the_lid_of_the_training_data_are_refused(steps_folder, cconv, tmp_path):
+    shutil.copytree(steps_folder, tmp_path / "lid")
+    for split in ("train", "valid", "test"):
+        with h5py.File(tmp_path / "lid" / f"{split}.h5", "r+") as file:
+            for group in file.values():
+                group["particle_type"][:9] = ParticleType.MOVING_WALL
+    (tmp_path / "study.toml").write_text(STUDY.format(layers=1))
+    assert cconv("fit", tmp_path / "study.toml", "--data", tmp_path / "lid", "--out", tmp_path / "model")[0] == 0
+    assert cconv("rollout", tmp_path / "model", "--frames", 2)[0] == 0
+    outcome = cconv("rollout", tmp_path / "model", "--data", steps_folder, "--out", tmp_path / "out")
+    assert_one_clear_line(outcome, "trained beside particles of type moving wall (2), and the data have none")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_integrator_adds_the_force_of_data_that_say_one_and_is_refused_where_there_is_none(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from cconv.evaluation.solver_cost import SolverCost, measure_state
 from cconv.rollout.coarse_solver_model import CoarseSolverModel
 from cconv.rollout.rollout import StepModel
 from cconv.rollout.solver_model import SolverModel
-from cconv.scenes.coarse import coarse_state, coarser_scenes
+from cconv.scenes.coarse import coarse_state, coarser_scenes, with_slow_sound
 from cconv.scenes.simulated_scene import SimulatedScene
 from cconv.tasks.samples import StepSample
 
@@ -27,11 +28,13 @@ class MeasuredSolver:
 
     Attributes:
         factor: Its particle spacing ÷ that of the data; 1 for the solver that made them.
+        sound_ratio: Its speed of sound ÷ the reference speed of the scene.
         cost: Cost of a frame, without the search for where the particles of the data are in a coarse flow.
         errors: Errors of its rollouts.
     """
 
     factor: float
+    sound_ratio: float
     cost: SolverCost
     errors: tuple[RolloutErrors, ...]
 
@@ -53,6 +56,8 @@ def measure_solvers(
 ) -> list[MeasuredSolver]:
     """Measure the solver, then coarser and coarser ones, until one takes no longer for a frame than is allowed.
 
+    If it is not the solver itself, those with a lower speed of sound follow, again from the finest on.
+
     Args:
         scene: Scene of the starts.
         starts: Starts of rollouts, at least one.
@@ -63,17 +68,31 @@ def measure_solvers(
         DataError: If the walls of the starts are not those of the scene.
         SimulationError: If the solver blows up while it is timed.
     """
-    task, state = starts[0].task, restart(scene, starts[0].window).state
-    cost = measure_state(scene, state, threads=threads, repeats=REPEATS)
-    found = [MeasuredSolver(factor=1.0, cost=cost, errors=_errors(SolverModel(scene, task), starts))]
-    for coarse in coarser_scenes(scene):
-        if found[-1].cost.ms_per_frame <= until_ms:
+    found: list[MeasuredSolver] = []
+    for finest in filter(None, (scene, with_slow_sound(scene))):
+        for run in chain([finest], coarser_scenes(finest)):
+            found.append(_measured(scene, run, starts, threads))
+            if found[-1].cost.ms_per_frame <= until_ms:
+                break
+        if len(found) == 1:
             break
-        cost = measure_state(coarse, coarse_state(scene, coarse, state), threads=threads, repeats=REPEATS)
-        factor = coarse.particle_spacing / scene.particle_spacing
-        errors = _errors(CoarseSolverModel(scene, coarse, task), starts)
-        found.append(MeasuredSolver(factor=factor, cost=cost, errors=errors))
     return found
+
+
+def _measured(scene: SimulatedScene, run: SimulatedScene, starts: Sequence[StepSample], threads: int) -> MeasuredSolver:
+    """Measure the solver of a scene, or of `run`, a cheaper form of it."""
+    task, start = starts[0].task, starts[0].window
+    factor = run.particle_spacing / scene.particle_spacing
+    state = restart(run if factor == 1 else scene, start).state
+    if factor != 1:
+        state = coarse_state(scene, run, state)
+    model = SolverModel(run, task) if factor == 1 else CoarseSolverModel(scene, run, task)
+    return MeasuredSolver(
+        factor=factor,
+        sound_ratio=run.sound_ratio,
+        cost=measure_state(run, state, threads=threads, repeats=REPEATS),
+        errors=_errors(model, starts),
+    )
 
 
 def _errors(model: StepModel, starts: Sequence[StepSample]) -> tuple[RolloutErrors, ...]:

@@ -129,7 +129,7 @@ def solve_closed_form(
     layer.assign([system.solve(ridge) for system in equations])
 
 
-def _answered(rows: Float[Tensor, "R P"], inputs: Inputs) -> Float[Tensor, "R P"]:
+def _answered(rows: Float[Tensor, "R P"], inputs: Inputs) -> Float[Tensor, "A P"]:
     """Rows of the particles that are asked about, which have one row each, or one for each component."""
     if inputs.answered is None:
         return rows

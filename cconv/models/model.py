@@ -11,7 +11,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from cconv.data.trajectory import Frame, Scene
+from cconv.data.trajectory import Frame, ParticleType, Scene
 from cconv.data.window import Window
 from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.relaxation import Relaxation
@@ -25,7 +25,7 @@ from cconv.sph.kernels import KERNELS, AbstractKernel
 from cconv.tasks import TASKS, task_named
 from cconv.tasks.features import CONSTANT, WALLS
 from cconv.tasks.inputs import Inputs
-from cconv.tasks.samples import Sample
+from cconv.tasks.samples import Sample, StepSample
 from cconv.tasks.task import StepTask, Task, as_step
 from cconv.validation import Length, Real, StrictModel, Whole, validated
 
@@ -41,6 +41,7 @@ class ModelConfig(StrictModel):
     features of the task that are inputs of the model.
     `predictor` is the model whose step the network corrects, if there is one.
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
+    `wall_types` are the types of the training data's wall particles, values of `ParticleType`, for a step task.
     `relaxation` is what rollouts of a step apply after every frame. `force_travel` is that of a step task to which the
     integrator adds the external force, in particle spacings.
     """
@@ -55,6 +56,7 @@ class ModelConfig(StrictModel):
     features: tuple[str, ...] = Field(max_length=100)
     wall_scalars: Whole = Field(ge=0, le=1)
     wall_vectors: Whole = Field(ge=0, le=1)
+    wall_types: tuple[Whole, ...] = Field((), max_length=100)
     network: NetworkTable
     predictor: "ModelConfig | None" = None
     relaxation: Relaxation | None = None
@@ -283,8 +285,23 @@ class Model(nn.Module):
         return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
 
     def inputs(self, frame: Frame | Window, scene: Scene) -> Inputs:
-        """Compute the inputs of a frame or window, only the features that the model takes."""
+        """Compute the inputs of a frame or window, only the features that the model takes.
+
+        Raises:
+            ShapeError: If a window lacks walls that the training data had.
+        """
+        if isinstance(frame, Window):
+            self._check_walls(frame)
         return self.task.inputs(frame, scene, self.config.features)
+
+    def _check_walls(self, window: Window) -> None:
+        absent = set(self.config.wall_types) - set(window.particle_types.tolist())
+        if absent:
+            names = " and ".join(str(ParticleType(each).name).lower().replace("_", " ") for each in sorted(absent))
+            raise ShapeError(
+                f"The model was trained beside particles of type {names} ({', '.join(map(str, sorted(absent)))}), and "
+                "the data have none; add them to the files, or use a checkpoint of a scene without them."
+            )
 
     def _check(self, inputs: Inputs) -> None:
         if inputs.dim != self.config.dim:
@@ -342,6 +359,7 @@ def build_model(
         features=tuple(name for name in task.features if name in names),
         wall_scalars=walls.scalars,
         wall_vectors=walls.vectors,
+        wall_types=_wall_types(train_samples[0]),
         network=network,
         predictor=None if predictor is None else predictor.config,
     )
@@ -356,6 +374,12 @@ def build_model(
     if predictor is not None and model.predictor is not None:
         model.predictor.load_state_dict(predictor.state_dict())
     return model
+
+
+def _wall_types(sample: Sample) -> tuple[int, ...]:
+    """Types of the particles of a step that are not fluid, ascending."""
+    types = set(sample.window.particle_types.tolist()) if isinstance(sample, StepSample) else set()
+    return tuple(sorted(types - {ParticleType.FLUID}))
 
 
 def absent_features(task: Task, names: Collection[str], samples: Sequence[Sample]) -> set[str]:

@@ -10,7 +10,7 @@ import plotly.io
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
 from cconv.report.published import published_errors
 from cconv.report.speed_accuracy import error_range
-from cconv.report.tables import MEAN_PREDICTOR, SOLVER, speed_accuracy_table
+from cconv.report.tables import MEAN_PREDICTOR, speed_accuracy_table
 from cconv.study.records.summary import Front, Summary
 
 _SYMBOLS = {"recommended": "star", "baseline": "square", "thesis's best": "diamond", "finalist": "circle"}
@@ -42,8 +42,8 @@ def interactive_chart(summary: Summary) -> go.Figure:
             figure.add_trace(_finalists_trace(group, members))
     if not analytic.empty:
         figure.add_trace(_analytic_trace(analytic, low))
-    if not solvers.empty:
-        figure.add_trace(_solvers_trace(solvers))
+    for group, series in solvers.groupby("group", sort=False):
+        figure.add_trace(_solvers_trace(str(group), series))
     figure.update_xaxes(title="time per frame [ms]", type="log")
     figure.update_yaxes(title=f"error ({summary.task.error})", type="log", dtick=1, exponentformat="power")
     figure.update_yaxes(range=[math.log10(low), math.log10(high)])
@@ -134,14 +134,14 @@ def _analytic_trace(analytic: pd.DataFrame, edge: float) -> go.Scatter:
     )  # fmt: skip
 
 
-def _solvers_trace(solvers: pd.DataFrame) -> go.Scatter:
+def _solvers_trace(name: str, solvers: pd.DataFrame) -> go.Scatter:
     text = [
         f"<b>{row.name}</b><br>error {row.error:.4g}"
         f"<br>{row.ms:.3g} ms per frame ({row.ms_low:.3g} to {row.ms_high:.3g})"
         for row in solvers.itertuples(index=False)
     ]
     return go.Scatter(
-        x=solvers["ms"], y=solvers["error"], mode="lines+markers", name=SOLVER, hovertext=text, hoverinfo="text",
+        x=solvers["ms"], y=solvers["error"], mode="lines+markers", name=name, hovertext=text, hoverinfo="text",
         marker={"symbol": "cross", "size": 12, "color": SOLVER_COLOR}, line={"color": SOLVER_COLOR, "width": 1},
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogFormatter
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
 from cconv.report.plots import mark_mean_predictor, new_figure
 from cconv.report.published import published_errors
-from cconv.report.tables import ANALYTIC, SOLVER, speed_accuracy_table
+from cconv.report.tables import ANALYTIC, speed_accuracy_table
 from cconv.study.records.summary import Summary
 
 _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
@@ -109,10 +109,9 @@ def _draw_finalist(axes: Axes, row: Any) -> None:
 
 
 def _draw_solvers(axes: Axes, solvers: pd.DataFrame) -> None:
-    """Draw the solver and coarser ones on a line, each with its name."""
-    if solvers.empty:
-        return
-    axes.plot(solvers["ms"], solvers["error"], "-P", color=SOLVER_COLOR, markersize=8, lw=0.8, zorder=4, label=SOLVER)
+    """Draw the solver and coarser ones on a line, each with its name; those with slow sound on a dotted line."""
+    for (group, series), line in zip(solvers.groupby("group", sort=False), ("-P", ":P"), strict=False):
+        axes.plot(series["ms"], series["error"], line, color=SOLVER_COLOR, markersize=8, lw=0.8, zorder=4, label=group)
     for row in solvers.itertuples():
         axes.annotate(
             row.name,

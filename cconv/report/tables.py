@@ -217,15 +217,17 @@ def _search_points(summary: Summary) -> list[dict]:
 
 
 def _solver_points(summary: Summary) -> list[dict]:
+    points = summary.solver.points if summary.solver else ()
     return [
         {
-            "name": SOLVER if point.factor == 1 else f"{SOLVER}, {point.factor:.3g} times coarser",
+            "name": f"{group}, {point.factor:.3g} times coarser" if point.factor != 1 else group,
             "kind": "solver",
-            "group": SOLVER,
+            "group": group,
             "error": point.error,
             "ms": point.ms_per_frame,
             "ms_low": point.ms_low,
             "ms_high": point.ms_high,
         }
-        for point in (summary.solver.points if summary.solver else ())
+        for point in points
+        for group in [SOLVER if point.sound_ratio == points[0].sound_ratio else f"{SOLVER}, slow sound"]
     ]

@@ -38,6 +38,7 @@ class SimulatedScene(ABC):
         skipped_frames: Frames before the first that is stored, until the flow has developed.
         num_trajectories: Trajectories of a data set; a single one is cut in time.
         relaxation_steps: Steps that spread the particles at the start.
+        sound_ratio: Speed of sound ÷ reference speed; densities deviate by about its inverse square from rest.
 
         name: Name of the scene.
         case: Name of the scene in LagrangeBench.
@@ -45,7 +46,7 @@ class SimulatedScene(ABC):
         source: Where the scene is defined.
         sizes: Settings of each size, "published" and "small".
         rest_density: ρ_0.
-        reference_speed: Largest speed expected; the speed of sound is ten times as large.
+        reference_speed: Largest speed expected.
         background_pressure: Background pressure in units of ρ_0 c²/γ.
         density_scheme: "summation" or "evolution".
         artificial_viscosity: α as published, which belongs to a speed of sound of 10.
@@ -65,6 +66,7 @@ class SimulatedScene(ABC):
     skipped_frames: int = 0
     num_trajectories: int = 8
     relaxation_steps: int = 1000
+    sound_ratio: float = 10.0
 
     name: ClassVar[str]
     case: ClassVar[str]
@@ -81,7 +83,7 @@ class SimulatedScene(ABC):
     varying_viscosity: ClassVar[bool] = False
 
     def __post_init__(self):
-        for name in ("particle_spacing", "viscosity"):
+        for name in ("particle_spacing", "viscosity", "sound_ratio"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"`{name}` must be positive, got {getattr(self, name)}.")
         for name, least in (("steps_per_frame", 1), ("num_frames", 1), ("num_trajectories", 1), ("skipped_frames", 0)):
@@ -159,8 +161,8 @@ class SimulatedScene(ABC):
 
     @property
     def equation_of_state(self) -> EquationOfState:
-        """Linear, with a speed of sound ten times the reference speed."""
-        sound_speed = 10 * self.reference_speed
+        """Linear, with the speed of sound of the scene."""
+        sound_speed = self.sound_ratio * self.reference_speed
         return EquationOfState(
             rest_density=self.rest_density,
             sound_speed=sound_speed,

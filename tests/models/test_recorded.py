@@ -1,4 +1,4 @@
-"""Models of the density tasks predict what they predicted before features had names, to the last bit."""
+"""Models of the density tasks predict what they predicted before features had names, to the accuracy of float32."""
 
 import json
 from itertools import product
@@ -38,6 +38,4 @@ def test_predictions_are_the_recorded_ones(task, architecture, message, walls, d
     generator = torch.Generator().manual_seed(1)
     model = build_model(settings(message=message, **sizes), asked, features, scene, [sample], generator)
     predicted = model.predict_frame(frame, scene)
-    if torch.backends.cpu.get_cpu_capability() == about["cpu_capability"]:
-        assert torch.equal(predicted, recorded)
     torch.testing.assert_close(predicted, recorded, rtol=1e-4, atol=1e-5 * float(recorded.abs().max()))

@@ -27,6 +27,12 @@ def test_a_network_pays_that_errs_less_than_a_solver_of_its_speed():
     assert "2 times as far apart takes 2 ms and errs by 0.0002" in found
 
 
+def test_the_solver_with_slow_sound_counts_where_it_is_as_fast_and_the_most_accurate():
+    found = sentence(solver_comparison(1e-8, 2e-4, network_error=1e-4, slow=[1e-6, 5e-5]), 2.0)
+    assert found.startswith("A network does not pay for this scene: a coarser solver is as fast and no less accurate.")
+    assert "with particles 2 times as far apart and 0.5 of the speed of sound takes 2 ms and errs by 5e-05" in found
+
+
 @pytest.mark.parametrize(
     ("errors", "ms", "start"),
     [

@@ -233,7 +233,7 @@ def beside_the_solver(summary, folder="2D_TGV_2500_10kevery100", horizon=20):
     """A study of a step on data of a name, with two solvers."""
     return changed(
         summary,
-        solver=solver_comparison(1e-6, 2e-4),
+        solver=solver_comparison(1e-6, 2e-4, slow=[3e-6]),
         task=changed(summary.task, horizon=horizon),
         dataset=changed(summary.dataset, path=f"data/{folder}"),
     )
@@ -241,13 +241,14 @@ def beside_the_solver(summary, folder="2D_TGV_2500_10kevery100", horizon=20):
 
 def test_solvers_are_points_with_names_in_both_charts(summary):
     summary = beside_the_solver(summary)
-    names = {"SPH solver", "SPH solver, 2 times coarser"}
+    names = {"SPH solver", "SPH solver, 2 times coarser", "SPH solver, slow sound"}
     static, interactive = speed_accuracy_chart(summary), interactive_chart(summary)
     (axes,) = static.axes
     assert names <= {text.get_text() for text in axes.texts}
-    (trace,) = (trace for trace in interactive.data if trace.name == "SPH solver")
+    trace, slow = (trace for trace in interactive.data if str(trace.name).startswith("SPH solver"))
     assert (list(trace.x), list(trace.y)) == ([8, 2], [1e-6, 2e-4])
-    assert names == {re.match("<b>(.*?)</b>", text)[1] for text in trace.hovertext}
+    assert (list(slow.x), list(slow.y)) == ([8], [3e-6])
+    assert names == {re.match("<b>(.*?)</b>", text)[1] for text in (*trace.hovertext, *slow.hovertext)}
     assert axes.get_ylim()[0] < 1e-6
 
 

@@ -1,6 +1,7 @@
 """The solver run coarser: the same frames and space, velocity fields that are interpolated well, a flow that decays."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from cconv.data.simulate import next_frame
 from cconv.errors import ConfigError
 from cconv.scenes import SCENES, scene_named
-from cconv.scenes.coarse import coarse_state, coarser, coarser_scenes, velocities_at
+from cconv.scenes.coarse import coarse_state, coarser, coarser_scenes, velocities_at, with_slow_sound
 
 
 @pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.dim == 2])
@@ -23,6 +24,15 @@ def test_a_coarser_scene_has_the_same_frames_in_fewer_and_larger_steps(name):
     if len(inner[0]):
         widths = [walls.amax(dim=0) + walls.amin(dim=0) for walls in inner]
         torch.testing.assert_close(*widths, rtol=0, atol=2 * scene.particle_spacing)
+
+
+def test_slow_sound_halves_the_steps_unless_viscosity_or_force_set_them():
+    scene = scene_named("dam_break_2d")
+    slow = with_slow_sound(scene)
+    assert slow.frame_dt == pytest.approx(scene.frame_dt)
+    assert slow.equation_of_state.sound_speed == scene.equation_of_state.sound_speed / 2
+    assert slow.steps_per_frame < 0.6 * coarser(scene, 1).steps_per_frame  # acoustic: dt = 0.25 h / (c + u)
+    assert with_slow_sound(replace(scene, viscosity=10.0, time_step=math.inf)) is None
 
 
 def test_what_cannot_be_coarser_is_refused():

@@ -367,6 +367,7 @@ class SolverPoint(StrictModel):
 
     Attributes:
         factor: Its particle spacing ÷ that of the data; 1 for the solver that made them.
+        sound_ratio: Its speed of sound ÷ the largest speed that its scene expects.
         num_particles: Number of its fluid particles.
         steps: Its steps of a frame.
         ms_per_frame: Median time of a frame, ms.
@@ -377,6 +378,7 @@ class SolverPoint(StrictModel):
     """
 
     factor: NonNegative
+    sound_ratio: NonNegative
     num_particles: Count
     steps: Count
     ms_per_frame: NonNegative
@@ -390,7 +392,7 @@ class SolverComparison(StrictModel):
     """The solver that made the data beside the recommended model of a step.
 
     Attributes:
-        points: The solver itself, then coarser and coarser ones; empty if it was not measured.
+        points: The solver itself, then cheaper forms, the usual speed of sound first; empty if it was not measured.
         rollouts: Number of rollouts of the test split that it was measured on.
         network_error: Error of the recommended model on the same rollouts, mean over its seeds; None without points.
         why_none: The reason why it was not measured, or "".

@@ -49,6 +49,7 @@ def _point(found: MeasuredSolver) -> SolverPoint:
     cost = found.cost
     return SolverPoint(
         factor=found.factor,
+        sound_ratio=found.sound_ratio,
         num_particles=cost.num_particles,
         steps=cost.steps,
         ms_per_frame=cost.ms_per_frame,
