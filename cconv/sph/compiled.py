@@ -1,9 +1,10 @@
-"""The sums D1, D2 and D3 as compiled loops over rows of neighbours: as fast as SPH gets here, without derivatives.
+"""SPH sums as compiled loops over rows of neighbours: as fast as SPH gets here, without derivatives.
 
 Kernels come from tables of cubic polynomials, within 1e-6 of their largest value; `cconv.sph.operators` is exact.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,19 @@ class CompiledSums:
         check_sum(edges, self.kernel, masses=(masses, (particles,)), densities=(densities, (particles,)))
         return self._sum(_gradients, edges, masses, (particles, edges.dim), self._slopes(masses), _array(densities))
 
+    def velocity_gradient(self, volumes: Tensor, velocities: Tensor, edges: Edges) -> Tensor:
+        """Gradient of the velocity (N, D, D), as `cconv.sph.velocity_gradient`.
+
+        Raises:
+            ShapeError: If shapes do not fit the edges.
+            ConfigError: If the edges are bipartite, or the kernel reaches further.
+        """
+        check_one_set(edges)
+        particles, dim = edges.num_senders, edges.dim
+        check_sum(edges, self.kernel, volumes=(volumes, (particles,)), velocities=(velocities, (particles, dim)))
+        shape, slopes = (particles, dim, dim), self._slopes(volumes)
+        return self._sum(_velocity_gradients, edges, volumes, shape, slopes, _array(velocities))
+
     def _values(self, like: Tensor) -> np.ndarray:
         return self._tables[_array(like).dtype.type][0]
 
@@ -100,6 +114,12 @@ class CompiledSums:
 
         run_on_workers(work, workers)
         return torch.from_numpy(output)
+
+
+@lru_cache(maxsize=16)
+def compiled_sums(kernel: AbstractKernel) -> CompiledSums:
+    """The sums with a kernel, whose tables are kept."""
+    return CompiledSums(kernel)
 
 
 def _array(values: Tensor) -> np.ndarray:
@@ -149,3 +169,21 @@ def _gradients(first, last, splits, senders, displacements, distances, masses, s
                     output[i, axis] += factor * displacements[k, axis]
         for axis in range(uintp(dim)):
             output[i, axis] /= densities[i]
+
+
+@_compile
+def _velocity_gradients(
+    first, last, splits, senders, displacements, distances, volumes, scale, table, velocities, output
+):
+    reach, dim = len(table) - 1, displacements.shape[1]
+    for i in range(uintp(first), uintp(last)):
+        for k in range(uintp(splits[i]), uintp(splits[i + 1])):
+            distance = distances[k]
+            place = distance * scale
+            if place < reach and distance > 0:
+                j = uintp(senders[k])
+                factor = volumes[j] * look_up(table, place) / distance
+                for a in range(uintp(dim)):
+                    change = factor * (velocities[j, a] - velocities[i, a])
+                    for b in range(uintp(dim)):
+                        output[i, a, b] += change * displacements[k, b]

@@ -16,6 +16,7 @@ from cconv.data.window import Window
 from cconv.domain import Box
 from cconv.neighbors import Edges, radius_graph
 from cconv.nn.kinds import Kinds
+from cconv.sph.compiled import compiled_sums
 from cconv.sph.kernels import AbstractKernel
 from cconv.sph.operators import density, velocity_gradient
 from cconv.tasks.inputs import Features, Inputs, Units, spread_densities, units_of
@@ -132,6 +133,18 @@ class WindowState(FluidState):
         return None if self.batch_index is None else self.batch_index[self.is_fluid]
 
     @property
+    def _is_differentiated(self) -> bool:
+        """Whether derivatives are asked for, or the particles are not on the CPU, which compiled sums do not know."""
+        return self.positions.requires_grad or self.positions.device.type != "cpu"
+
+    @cached_property
+    def densities(self) -> Float[Tensor, " N"]:
+        """Density by summation over the particles of all types (D1), (N,), to 1e-6 where it is not differentiated."""
+        if self._is_differentiated:
+            return density(self.masses, self.edges, self.kernel)
+        return compiled_sums(self.kernel).density(self.masses, self.edges)
+
+    @property
     def pressure_sources(self) -> Float[Tensor, " N"]:
         r"""Source of the pressure in the Poisson equation of an incompressible flow, divided by the density, (N,).
 
@@ -140,7 +153,11 @@ class WindowState(FluidState):
         It is positive where the flow strains and negative where it turns. Networks whose values are scalars and vectors
         cannot form it, since it is a square of a tensor. Source: Pope, "Turbulent Flows" (2000), section 2.5.
         """
-        gradients = velocity_gradient(self.masses / self.densities, self.velocities, self.edges, self.kernel)
+        volumes = self.masses / self.densities
+        if self._is_differentiated:
+            gradients = velocity_gradient(volumes, self.velocities, self.edges, self.kernel)
+        else:
+            gradients = compiled_sums(self.kernel).velocity_gradient(volumes, self.velocities, self.edges)
         return torch.einsum("nab,nba->n", gradients, gradients)
 
     @cached_property

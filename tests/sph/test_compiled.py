@@ -6,7 +6,7 @@ import torch
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 from cconv.neighbors import radius_graph
-from cconv.sph import KERNELS, CubicSpline, density, density_gradient, density_rate, kernel_named
+from cconv.sph import KERNELS, CubicSpline, density, density_gradient, density_rate, kernel_named, velocity_gradient
 from cconv.sph.compiled import CompiledSums
 
 
@@ -40,6 +40,8 @@ def test_sums_are_those_of_the_operators(name, dim, periodic, dtype, generator):
     close(sums.density_rate(masses, velocities, edges), density_rate(masses, velocities, edges, kernel), dtype)
     reference = density_gradient(masses, densities, edges, kernel)
     close(sums.density_gradient(masses, densities, edges), reference, dtype)
+    reference = velocity_gradient(masses / densities, velocities, edges, kernel)
+    close(sums.velocity_gradient(masses / densities, velocities, edges), reference, dtype)
 
 
 def test_sums_are_those_over_all_pairs(generator):
