@@ -1,5 +1,7 @@
-"""`cconv study`: run a study, continue it, add trials, show its state."""
+"""`cconv study`: run a study, continue it, add trials, show its state, compare several."""
 
+import json
+import math
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +14,8 @@ from cconv.cli.live import StudyDisplay
 from cconv.errors import CConvError, ConfigError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.records.summary import Summary
 
@@ -199,6 +203,64 @@ def status(
     if best is not None:
         settings = " ".join(f"{key}={value}" for key, value in best["parameters"].items())
         results.print(f"best: {best['trial']}, validation error {best['valid_error']:.4g} ({settings})")
+
+
+@app.command()
+def compare(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders of finished studies, at least two.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the page to FILE.html.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE if it exists.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
+) -> None:
+    """Compare what studies recommend: scene by scene the smallest sufficient model, its error, cost and inputs.
+
+    Studies that ask the same of the same data as the first are compared by the ratio of their errors.
+    """
+    from cconv.report.comparison import answers_table, compared_runs, differences_table, write_comparison
+    from cconv.study.records.run_folder import RunFolder
+
+    if out is not None and out.suffix != ".html":
+        raise ConfigError(f"`--out` must name an .html file, got {out}.")
+    if out is not None and out.exists() and not overwrite:
+        raise ConfigError(f"{out} exists; name another file, or give --overwrite.")
+    compared = compared_runs([RunFolder.open(path) for path in runs])
+    answers, differences = answers_table(compared), differences_table(compared)
+    if out is not None:
+        write_comparison(compared, out)
+    if as_json:
+        tables = {"answers": answers, "differences": differences}
+        print_json({name: json.loads(table.to_json(orient="records")) for name, table in tables.items()})
+        return
+    results.print(_answers_table(answers))
+    for row in differences.itertuples():
+        interval = row.why_none or f"95 %: {row.ci95_low:.3g} to {row.ci95_high:.3g}"
+        results.print(f"error of {row.study} ÷ {row.reference}: {row.ratio:.3g} ({interval})", soft_wrap=True)
+    if out is not None:
+        results.print(f"Page: {out}", soft_wrap=True)
+
+
+def _answers_table(answers: "pd.DataFrame") -> Table:
+    table = Table(
+        title="Recommended models: test error, ms per frame, the solver's frame as a multiple",
+        title_justify="left",
+        padding=(0, 0),
+    )
+    table.add_column("study", overflow="fold", min_width=16)
+    for name in ("parameters", "error", "95 %", "ms", "solver ÷", "stable"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in answers.itertuples():
+        table.add_row(
+            row.study,
+            f"{row.parameters:,}",
+            f"{row.error:.3g}",
+            "none" if math.isnan(row.ci95_low) else f"{row.ci95_low:.2g}–{row.ci95_high:.2g}",
+            f"{row.ms_per_frame:.3g}",
+            "–" if math.isnan(row.solver) else f"{row.solver:.2f}",
+            "yes" if row.stable else "no",
+        )
+    return table
 
 
 def _finalists_table(summary: "Summary") -> Table:

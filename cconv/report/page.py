@@ -29,22 +29,23 @@ def write_report(run: RunFolder) -> Path:
 
 def render_report(run: RunFolder) -> str:
     """HTML of the report, charts included: the sections that apply, one after the other."""
-    templates, records = _templates(), Records.read(run)
+    pages, records = templates(), Records.read(run)
     summary = run.summary() if run.has_summary else None
     shown = [section for section in SECTIONS if section.applies(summary)]
     known = {"summary": summary, "records": records}
     bodies = {
-        section.name: templates.get_template(f"sections/{section.name}.html.j2").render(
+        section.name: pages.get_template(f"sections/{section.name}.html.j2").render(
             **known,
             **section.draw(cast(Summary, summary), records),  # one that applies without a summary takes None
         )
         for section in shown
     }
-    page = templates.get_template("report.html.j2")
+    page = pages.get_template("report.html.j2")
     return page.render(**known, state=run.read("state.json"), sections=shown, bodies=bodies)
 
 
-def _templates() -> Environment:
+def templates() -> Environment:
+    """Templates of pages, which escape what they are given, and the filters that they use."""
     environment = Environment(
         loader=PackageLoader("cconv.report"),
         autoescape=select_autoescape(["html.j2"]),
