@@ -1,0 +1,105 @@
+"""Whole rollouts of checkpoints, plain and relaxed, as a table in Markdown: the measures of Neural SPH's tables.
+
+    python experiments/relaxation_table.py --data FOLDER --relax 0.02,0.3,3 NAME=CHECKPOINT [NAME=CHECKPOINT ...]
+
+Rows are the checkpoints without and with the relaxation (`_p`). A number is the mean over the trajectories of the split,
+with a 95 % interval by Student's t where there are three or more. Checkpoints of one name are trainings of one model
+with several seeds. Sinkhorn divergence, densities, energies and Chamfer distance are those of the last frame, energies
+and Dirichlet energies as a multiple of the stored ones. Where a rollout diverges, only the number of these is told.
+"""
+
+import argparse
+import math
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import t as student
+
+from cconv import load_model, open_dataset
+from cconv.data.stored_frames import StoredFrames
+from cconv.evaluation.recorded_rollout import RecordedRollout, asked_rollout, record_rollout
+from cconv.models.model import Model
+from cconv.rollout.correctors import SPHRelaxation
+from cconv.tasks.task import as_step
+
+SHORT = 20  # frames of the published short rollouts
+COLUMNS = ("MSE20", "MSE", "Sinkhorn", "E_kin", "mean abs(ρ - 1)", "Dirichlet", "Chamfer")
+
+
+def measures(found: RecordedRollout) -> list[float]:
+    """Measures of a rollout in the order of `COLUMNS`."""
+    metrics = found.metrics
+    own, stored = metrics.rollout, metrics.reference
+    return [
+        float(metrics.mse[:SHORT].mean()),
+        float(metrics.mse.mean()),
+        float(metrics.sinkhorn[-1]),
+        float(own.e_kin[-1] / stored.e_kin[-1]),
+        float(own.rho_mae[-1]),
+        float(own.dirichlet[-1] / stored.dirichlet[-1]),
+        float(metrics.chamfer[-1]),
+    ]
+
+
+def in_words(values: np.ndarray) -> str:
+    """Mean of a table (seeds, trajectories), with the interval over its longer side's means where these are three."""
+    if not values.size:
+        return "–"
+    means = values.mean(axis=0) if values.shape[1] >= values.shape[0] else values.mean(axis=1)
+    if len(means) < 3:
+        return f"{values.mean():.2g}"
+    width = student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means))
+    return f"{values.mean():.2g} ({max(0.0, values.mean() - width):.2g} to {values.mean() + width:.2g})"
+
+
+def rolled(model: Model, stored: StoredFrames, scene, relaxation: SPHRelaxation | None, frames: int | None):
+    """A rollout from the first frame of a trajectory on."""
+    correctors = () if relaxation is None else (relaxation,)
+    return record_rollout(
+        model, asked_rollout(as_step(model.task), stored, scene, frames=frames, correctors=correctors)
+    )
+
+
+def main() -> None:
+    """Roll out and print a row as soon as it is known."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", metavar="NAME=CHECKPOINT")
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--trajectories", type=int, default=1)
+    parser.add_argument("--frames", type=int, help="frames of each rollout; by default all that are stored")
+    parser.add_argument("--relax", required=True, metavar="ALPHA,BETA,LOOPS")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    alpha, beta, loops = arguments.relax.split(",")
+    variants = {"": None, "_p": SPHRelaxation(float(alpha), float(beta), int(loops))}
+    dataset, models = open_dataset(arguments.data), defaultdict(list)
+    for each in arguments.checkpoints:
+        name, _, path = each.partition("=")
+        models[name].append(load_model(path))
+    print(f"| model | ms per frame | {' | '.join(COLUMNS)} | diverged |")
+    print("|" + "---|" * (len(COLUMNS) + 3))
+    for name, trainings in models.items():
+        for suffix, relaxation in variants.items():
+            found = [
+                [
+                    rolled(
+                        model, StoredFrames(dataset, arguments.split, k), dataset.scene, relaxation, arguments.frames
+                    )
+                    for k in range(arguments.trajectories)
+                ]
+                for model in trainings
+            ]
+            diverged = [[each.ended is not None for each in row] for row in found]
+            finished = not np.any(diverged)
+            table = np.array([[measures(each) for each in row] for row in found]) if finished else np.empty((0, 0, 7))
+            ms = np.median([np.median(each.milliseconds) for row in found for each in row])
+            cells = [in_words(table[:, :, column]) for column in range(len(COLUMNS))]
+            ended = f"{np.sum(diverged)} of {np.size(diverged)}"
+            print(f"| {name}{suffix} | {ms:.0f} | {' | '.join(cells)} | {ended} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
