@@ -2,7 +2,7 @@
 
     python experiments/relaxation_table.py --data FOLDER --relax 0.02,0.3,3 NAME=CHECKPOINT [NAME=CHECKPOINT ...]
 
-Rows are the checkpoints without and with the relaxation (`_p`). A number is the mean over the trajectories of the split,
+Rows are the checkpoints without and with the relaxation (`_p`). Numbers are means over the trajectories of the split,
 with a 95 % interval by Student's t where there are three or more. Checkpoints of one name are trainings of one model
 with several seeds. Sinkhorn divergence, densities, energies and Chamfer distance are those of the last frame, energies
 and Dirichlet energies as a multiple of the stored ones. Where a rollout diverges, only the number of these is told.
