@@ -21,12 +21,12 @@ def check_size(size: int, stored: int, place: str) -> None:
     room = memory_limit()
     if size > room:
         raise DataError(
-            f"{place} takes {_readable(size)}, more than {_readable(room)}, half of the memory that is free; "
+            f"{place} takes {readable_size(size)}, more than {readable_size(room)}, half of the memory that is free; "
             "cut it into shorter trajectories."
         )
     if size > SMALL and size > LARGEST_RATIO * stored:
         raise DataError(
-            f"{place} claims {_readable(size)} but only {_readable(stored)} are stored; it was never written: "
+            f"{place} claims {readable_size(size)} but only {readable_size(stored)} are stored; it was never written: "
             "write it again."
         )
 
@@ -43,7 +43,8 @@ def one_line(value: object, longest: int = LONGEST_TEXT) -> str:
     return shown + (f"... ({len(text)} characters)" if len(text) > longest else "")
 
 
-def _readable(size: float) -> str:
+def readable_size(size: float) -> str:
+    """A number of bytes in the unit that a reader expects, e.g. "1.5 GB"."""
     for unit in ("bytes", "KB", "MB", "GB"):
         if size < 1000:
             return f"{size:.3g} {unit}"

@@ -59,23 +59,42 @@ RESTARTS = 2  # of a training whose process or node died; it continues from its 
 def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | None = None) -> Iterator["RayPool"]:
     """Start a private Ray with one core a training, or join the cluster at `address`; delete its files in the end.
 
-    The private Ray listens on loopback only and demands the token of this run. A cluster must demand the user's token.
-
     Raises:
         ConfigError: If Ray cannot start on this machine, or the cluster cannot be joined.
     """
     folder = folder.absolute()
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        demand_tokens()
-        if address is None:
-            own = stack.enter_context(private_folder())
-            stack.enter_context(token_of_this_run(own))
-            stack.enter_context(on_loopback_alone())
-        stack.callback(ray.shutdown)
-        _start(study.concurrency, own) if address is None else _join(address)
+        stack.enter_context(private_ray(study.concurrency) if address is None else _cluster(address))
         ray._private.worker._worker_logs_enabled = False  # our records say which training died
         yield RayPool(study, problem, folder)
+
+
+@contextmanager
+def private_ray(cores: int) -> Iterator[None]:
+    """Start a Ray on this machine for so many trainings at once; it listens on loopback only and demands a token.
+
+    Raises:
+        ConfigError: If it cannot start.
+    """
+    demand_tokens()
+    with private_folder() as own, token_of_this_run(own), on_loopback_alone():
+        try:
+            _start(cores, own)
+            yield
+        finally:
+            ray.shutdown()
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[None]:
+    """Join the cluster at an address, which must demand the user's token."""
+    demand_tokens()
+    try:
+        _join(address)
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _start(cores: int, folder: Path) -> None:
