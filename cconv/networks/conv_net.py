@@ -226,6 +226,12 @@ class ConvNetSettings(ConvolutionSettings):
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
 
+    @property
+    def in_words(self) -> str:
+        """Its layers and the cells of their filters along an axis."""
+        layers = "convolution on a grid" if self.layers == 1 else f"{self.layers} convolutions on grids"
+        return f"{layers}, {self.kernel_size} cells a side"
+
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> ConvNet:

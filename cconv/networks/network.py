@@ -200,6 +200,11 @@ class NetworkSettings(StrictModel, ABC):
     architecture: str
     relative_cutoff: Real = Field(2.25, ge=1e-3, le=10)
 
+    @property
+    def in_words(self) -> str:
+        """What the network is, for a reader, e.g. "radial layer, 8 terms"."""
+        return self.architecture.replace("_", " ")
+
     @abstractmethod
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None

@@ -236,6 +236,12 @@ class RadialNetSettings(ConvolutionSettings):
     conserves_momentum: Flag = False
     skip: Literal["before_activation", "none"] = "before_activation"
 
+    @property
+    def in_words(self) -> str:
+        """Its layers and radial terms."""
+        layers = "radial layer" if self.layers == 1 else f"{self.layers} radial layers"
+        return f"{layers}, {self.radial_terms} terms"
+
     @model_validator(mode="after")
     def _pairs_weigh_each_other_alike(self) -> "RadialNetSettings":
         if self.conserves_momentum and self.normalize:

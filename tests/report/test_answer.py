@@ -49,3 +49,14 @@ def test_a_network_does_not_pay_beside_a_solver_that_is_as_fast_and_as_accurate(
 def test_what_was_not_measured_is_said_with_the_reason():
     found = sentence(SolverComparison(why_none="no scene has the case 'X' in 2 dimensions"), 2.0)
     assert found == "The solver that made the data was not measured: no scene has the case 'X' in 2 dimensions."
+
+
+def test_models_are_called_by_what_they_are_and_the_others_have_reasons():
+    summary = RunFolder(SAMPLE).summary()
+    drawn = AnswerSection().draw(summary, None)
+    assert drawn["words"]["baseline"] == "4 convolutions on grids, 4 cells a side"
+    assert drawn["words"]["closed_form_0014_no_walls_no_density"] == "radial layer, 32 terms"
+    set_aside = {row["entry"].id: row["why"] for row in drawn["aside"]}
+    assert set(set_aside) == {entry.id for entry in summary.finalists} - {summary.recommended.id}
+    assert set_aside["baseline"].startswith("failed error 0.974 in regime near_wall")
+    assert all(set_aside.values())

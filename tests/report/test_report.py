@@ -131,7 +131,8 @@ def test_an_exact_model_has_no_ratio_of_errors(run):
     run.write_summary(changed(summary, finalists=finalists))
     text = words(render_report(run))
     assert "has a normalized MSE of 0 (" in text
-    assert "Compared with the recommended model, its time " in text
+    assert "The baseline takes " in text
+    assert "times the error" not in text
 
 
 def test_an_interval_that_is_not_given_has_its_reason(run, no_charts):

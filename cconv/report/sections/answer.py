@@ -3,32 +3,42 @@
 from typing import Any
 
 from cconv.report.sections.section import Records, Section
-from cconv.study.records.summary import FinalistEntry, SolverComparison, SolverPoint, Summary
+from cconv.study.records.summary import ComparedModel, FinalistEntry, SolverComparison, SolverPoint, Summary
 
 
 class AnswerSection(Section):
-    """Show the recommended model, the reason, and its figures."""
+    """Show the recommended model, its figures, the reason, and why the others are set aside."""
 
     name = "answer"
     title = "Answer"
     part = "recommended"
 
     def draw(self, summary: Summary, records: Records) -> dict[str, Any]:
-        """Return the reason in two parts, and the baseline as ratios to the recommended model if they differ."""
+        """Return names of the finalists in words, why the others are set aside, and the baseline as ratios."""
         baseline = summary.finalist(summary.baseline)
         other = None if baseline is summary.chosen else baseline
         return {
-            "reason": _lead(summary.recommended.reason),
+            "words": {entry.id: entry.in_words or entry.id for entry in summary.finalists},
+            "aside": _set_aside(summary),
             "baseline": other,
             "ratios": {} if other is None else _ratios(other, summary.chosen),
             "solver": _beside_the_solver(summary.solver, summary.chosen.cost.ms_per_frame) if summary.solver else "",
         }
 
 
-def _lead(text: str) -> tuple[str, str]:
-    """Split a text into its first sentence and the others."""
-    first, stop, others = text.partition(". ")
-    return first + stop.strip(), others
+def _set_aside(summary: Summary) -> list[dict[str, Any]]:
+    """The finalists that are not recommended, fastest first, each with the reason."""
+    compared = {each.id: each for each in summary.selection.comparisons}
+    chosen, entries = compared.pop(summary.recommended.id), {entry.id: entry for entry in summary.finalists}
+    return [
+        {"entry": entries[each.id], "why": each.why_not or _no_better(each, chosen)}
+        for each in compared.values()
+        if each.id in entries
+    ]
+
+
+def _no_better(model: ComparedModel, chosen: ComparedModel) -> str:
+    return "slower" if model.ms_per_frame > chosen.ms_per_frame else "as fast within the noise, and less accurate"
 
 
 def _ratios(baseline: FinalistEntry, chosen: FinalistEntry) -> dict[str, float | None]:

@@ -199,6 +199,7 @@ class FinalistEntry(StrictModel):
 
     Attributes:
         id: Its id.
+        in_words: What its network is, e.g. "radial layer, 8 terms"; "" in records of earlier versions.
         config: Its settings.
         num_parameters: Learned parameters.
         updates: Gradient updates of each training.
@@ -212,6 +213,7 @@ class FinalistEntry(StrictModel):
     """
 
     id: Id
+    in_words: str = ""
     config: FinalistConfig
     num_parameters: Count
     updates: Count

@@ -227,6 +227,7 @@ def finalist_entry(
     config = finalist.records[0].config
     return FinalistEntry(
         id=finalist.id,
+        in_words=load_model(finalist.best_checkpoint).settings.in_words,
         config=FinalistConfig(network=config["network"], training=config["training"], parameters=config["parameters"]),
         num_parameters=config["num_parameters"],
         updates=config["training"]["updates"],
