@@ -9,7 +9,7 @@ from particle_files import METADATA, record_frames, write_hdf5, write_parts
 
 from cconv.data.convert import convert
 from cconv.data.dataset import open_dataset
-from cconv.data.hdf5 import write_dataset
+from cconv.data.hdf5 import write_splits
 from cconv.data.trajectory import finite_difference_velocities
 from cconv.errors import ConfigError, DataError
 from cconv.forces import ConstantForce, ReversePoiseuilleForce
@@ -107,7 +107,7 @@ def test_a_force_is_known_by_its_case_and_code_beside_the_data_not_run(tmp_path,
 def test_a_force_is_declared_by_name_and_read_again(tmp_path, force):
     write_hdf5(tmp_path / "a")
     dataset = open_dataset(tmp_path / "a")
-    write_dataset(
+    write_splits(
         tmp_path / "b",
         replace(dataset.scene, force=force),
         {split: dataset.trajectories(split) for split in dataset.splits},
@@ -296,7 +296,7 @@ def test_failed_writing_leaves_nothing(tmp_path):
     with pytest.raises(DataError):
         convert(dataset, tmp_path / "b")
     with pytest.raises(DataError, match="'valid' has no trajectory"):
-        write_dataset(tmp_path / "c", dataset.scene, {"train": [dataset.trajectory("test", 0)]})
+        write_splits(tmp_path / "c", dataset.scene, {"train": [dataset.trajectory("test", 0)]})
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a"]
 
 
