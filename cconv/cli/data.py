@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from cconv.cli.console import errors, print_json, results, show_progress
+from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -177,6 +177,39 @@ def inspect(
 
 
 @app.command()
+def check(
+    path: DataFolder,
+    as_json: AsJson = False,
+    mass: Mass = None,
+    particle_spacing: Spacing = None,
+    frame_dt: FrameDt = None,
+    force: Force = None,
+) -> None:
+    """Check whether data are plausible before anything is computed; a study does so too.
+
+    Every trajectory is read. Suspicious data are a warning each, with trajectory, frame and particle, and what to do: a
+    spacing that does not fit, particles without neighbours, jumps, clumps, particles outside the box or at the same
+    place, fields that hardly differ. Data from which nothing can be learned end in exit status 2, and no study takes
+    them.
+    """
+    from cconv.data.plausibility import dataset_findings, refuse_nonsense
+    from cconv.tasks import field_tasks
+    from cconv.tasks.plausibility import field_findings
+
+    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    findings = dataset_findings(dataset, show_progress)
+    if not any(finding.stops for finding in findings):
+        findings += field_findings(dataset, field_tasks())
+    if as_json:
+        print_json([finding.as_dict() for finding in findings])
+    elif findings:
+        print_findings(finding for finding in findings if not finding.stops)
+    else:
+        results.print("nothing suspicious found")
+    refuse_nonsense(findings)
+
+
+@app.command()
 def convert(
     path: DataFolder,
     out: OutFolder,
@@ -228,7 +261,7 @@ def import_files(
         str | None,
         typer.Option(
             metavar="NUMBER=KIND,...",
-            help="Meaning of the particle type: fluid, wall, moving (walls, rigid bodies) or drop, e.g. '0=wall,3=fluid'.",
+            help="Meaning of particle types: fluid, wall, moving (walls, rigid bodies), drop; e.g. '0=wall,3=fluid'.",
         ),
     ] = None,
     fluid: Annotated[
@@ -266,7 +299,8 @@ def import_files(
     from cconv.data.hdf5 import FILES
     from cconv.data.importing.fields import parse_map
     from cconv.data.importing.particles import parse_types
-    from cconv.data.importing.plan import ImportSettings, plan_import
+    from cconv.data.importing.plan import plan_import
+    from cconv.data.importing.settings import ImportSettings
 
     check_free(out.absolute(), FILES, overwrite)
     settings = ImportSettings(

@@ -17,6 +17,7 @@ from cconv.data.trajectory import Boundary, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError
 
+Progress = Callable[[Iterable, str], Iterable]
 Array = Any  # what numpy makes an array of: lists, NumPy arrays, torch tensors on the CPU
 
 
@@ -158,7 +159,7 @@ def write_runs(
     runs: Sequence[str] | None,
     split: tuple[tuple[float, ...], int, int],
     overwrite: bool,
-    progress: Callable[[Iterable, str], Iterable] = lambda items, label: items,
+    progress: Progress = lambda items, label: items,
 ) -> None:
     """As `write_dataset`, with shares, gap and seed in one, for sequences that read a trajectory when it is asked for.
 
@@ -224,7 +225,9 @@ def _parts(block: Block, members: Sequence[int]) -> list[Block]:
 class _Trajectories:
     """Trajectories of a split, made one at a time when asked for; knows their number, for progress."""
 
-    def __init__(self, arrays: Sequence[ParticleArrays], blocks: Sequence[Block], scene: Scene, progress, split: str):
+    def __init__(
+        self, arrays: Sequence[ParticleArrays], blocks: Sequence[Block], scene: Scene, progress: Progress, split: str
+    ):
         self._arrays, self._blocks, self._scene = arrays, blocks, scene
         self._progress, self._split = progress, split
 

@@ -261,7 +261,15 @@ def nan_from(frame):
     return positions
 
 
-@pytest.mark.parametrize("key", ["dim", "dx", "dt", "write_every", "bounds", "periodic_boundary_conditions"])
+def test_frames_are_one_time_step_apart_where_nothing_says_how_many(tmp_path):
+    write_hdf5(tmp_path)
+    (tmp_path / "metadata.json").write_text(json.dumps({k: v for k, v in METADATA.items() if k != "write_every"}))
+    scene = open_dataset(tmp_path).scene
+    assert scene.frame_dt == METADATA["dt"]
+    assert any(line.startswith("frame dt: `write_every` is not stored") for line in scene.missing)
+
+
+@pytest.mark.parametrize("key", ["dim", "dx", "dt", "bounds", "periodic_boundary_conditions"])
 def test_missing_metadata_key_is_named(tmp_path, key):
     write_hdf5(tmp_path)
     (tmp_path / "metadata.json").write_text(json.dumps({k: v for k, v in METADATA.items() if k != key}))

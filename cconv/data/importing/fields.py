@@ -55,16 +55,16 @@ def find_fields(table: Table, mapping: Mapping[str, Sequence[str]]) -> dict[str,
         DataError: If a name is not in the file, or there are no positions.
     """
     found = {field: names for field in FIELDS if (names := _usual(table, field)) and field not in mapping}
-    for field, names in mapping.items():
-        for name in names:
+    for field, said in mapping.items():
+        for name in said:
             if name not in table.arrays:
                 known = one_line(", ".join(table.arrays))
                 raise DataError(
                     f"{table.file}: has no {one_line(name, 40)!r} for the {field}."
                     f"{did_you_mean(name, table.arrays)} It has {known}."
                 )
-        if names:
-            found[field] = tuple(names)
+        if said:
+            found[field] = tuple(said)
     if "position" not in found:
         known = one_line(", ".join(table.arrays)) or "nothing"
         raise DataError(f"{table.file}: has no positions among {known}; say what they are with --map position=NAME.")
@@ -111,13 +111,13 @@ def _usual(table: Table, field: str) -> tuple[str, ...]:
     for base in VECTORS[field]:
         if _is_axis(table, plain.get(base), 2):
             return (plain[base],)
-        for letters in COMPONENTS:
-            columns = [plain.get(base + letter) for letter in letters if base or letters == "xyz"]
+        for axes in COMPONENTS:
+            columns = [plain.get(base + letter) for letter in axes if base or axes == "xyz"]
             names = tuple(name for name in columns if name is not None)
-            if names and names == tuple(columns[: len(names)]) and all(_is_axis(table, name, 1) for name in names):
+            if names and list(names) == columns[: len(names)] and all(_is_axis(table, name, 1) for name in names):
                 return names
-    columns = [plain[name] for name in VELOCITY_COLUMNS if name in plain] if field == "velocity" else []
-    return tuple(columns) if len(columns) > 1 and columns[0] == plain.get("u") else ()
+    letters = [plain[name] for name in VELOCITY_COLUMNS if name in plain] if field == "velocity" else []
+    return tuple(letters) if len(letters) > 1 and letters[0] == plain.get("u") else ()
 
 
 def _is_axis(table: Table, name: str | None, axes: int) -> bool:

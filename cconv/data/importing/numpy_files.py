@@ -30,11 +30,10 @@ def read_npy(file: Path) -> list[Table]:
         DataError: If it holds something else.
     """
     check_size(file.stat().st_size, file.stat().st_size, str(file))
-    values = np.load(file, allow_pickle=False)
+    with file.open("rb") as stream:
+        values = np.lib.format.read_array(stream, allow_pickle=False)
     if values.ndim not in (2, 3):
-        raise DataError(
-            f"{file}: must hold positions (N, D) or (T, N, D), got {values.shape}; save them as .npz by name."
-        )
+        raise DataError(f"{file}: must hold positions (N, D) or (T, N, D) alone; save other arrays as .npz by name.")
     return stacked_tables(file, {"positions": values})
 
 

@@ -1,4 +1,4 @@
-"""Simulations put together from series of files: the frames of the fluid, of further phases and of walls, side by side."""
+"""Simulations put together from series of files: frames of the fluid, of further phases and of walls side by side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ def _check_one_series_a_folder(runs: Sequence[tuple[Series, Sequence[FrameRef]]]
 def _belonging(
     bodies: Sequence[tuple[Series, list[list[FrameRef]]]], series: Series, is_alone: bool
 ) -> list[list[FrameRef]]:
-    """Frames of the bodies that lie in the folder of a series, or of all where there is one run or they have one frame."""
+    """Frames of the bodies in the folder of a series, or of all where there is one run or they have a single frame."""
     found = []
     for body, runs in bodies:
         frames = [ref for refs in runs for ref in refs]

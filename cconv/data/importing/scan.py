@@ -13,6 +13,8 @@ from cconv.data.importing.series import FrameRef, Reader
 from cconv.data.trajectory import ParticleType
 from cconv.errors import DataError
 
+SAME_SPACING = 1e-3  # relative difference of particle spacings of one simulation
+
 
 @dataclass(frozen=True)
 class FrameReader:
@@ -140,7 +142,7 @@ def _check_alike(later: Particles, first: Particles) -> None:
                 f"{lacks.file}: has no {name}, {has.file.name} has; write it again, or leave it out with --map {name}="
             )
     spacings = [float(np.median(each.values["spacing"])) for each in (first, later) if "spacing" in each.values]
-    if len(spacings) == 2 and not np.isclose(*spacings, rtol=1e-3):
+    if len(spacings) == 2 and abs(spacings[1] - spacings[0]) > SAME_SPACING * spacings[0]:
         raise DataError(
             f"{later.file}: has the particle spacing {spacings[1]:g}, {first.file.name} has {spacings[0]:g}; it is of "
             "another simulation: leave it out."

@@ -1,7 +1,7 @@
 """VTK's XML files of points: unstructured grids (.vtu), poly data (.vtp), and collections of files (.pvd).
 
-Only points and their data are read, cells are not. meshio reads neither poly data nor attributes that are spelled with a
-capital, as SPHinXsys writes them, so both kinds are read here.
+Only points and their data are read, cells are not. meshio reads neither poly data nor attributes that are spelled with
+a capital, as SPHinXsys writes them, so both kinds are read here.
 
 Source: VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html
 """
