@@ -79,7 +79,7 @@ def plan_import(
     frame_dt, dt_from = frame_dt_of(runs, scans, settings)
     masses = Masses.of(scans[0].first, settings.mass, spacing ** len(axes))
     walls_move = any(scan.walls_move for scan in scans)
-    trajectories = ImportedTrajectories(runs, frames, axes, masses, settings.separate_frames, walls_move)
+    trajectories = ImportedTrajectories(runs, frames, axes, masses, settings.separate_frames, walls_move, frame_dt)
     if settings.separate_frames:
         _check_velocities(scans[0].first)
     missing = _missing(scans[0], settings, spacing_from, dt_from, masses, walls_move)

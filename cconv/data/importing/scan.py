@@ -113,6 +113,7 @@ def _scan(run: Run, frames: FrameReader, progress: Callable[[Iterable, str], Ite
         if solids is not None and walls is not None:
             _check_dimensions(solids, first)
             walls_move = walls_move or not np.array_equal(solids.positions, walls.positions)
+            change = change or _change(walls, solids)
         change = change or _change(first, particles)
         points = [each.positions for each in (particles, solids) if each is not None]
         counts.append(len(particles))

@@ -24,6 +24,7 @@ class ImportedTrajectories(Sequence[ParticleArrays]):
         masses: Masses of particles.
         separate: Whether each frame is a trajectory.
         walls_move: Whether walls from files of their own move.
+        frame_dt: Time between frames.
     """
 
     def __init__(
@@ -34,12 +35,13 @@ class ImportedTrajectories(Sequence[ParticleArrays]):
         masses: Masses,
         separate: bool,
         walls_move: bool,
+        frame_dt: float,
     ):
         self._frames, self._axes, self._masses, self._walls_move = frames, list(axes), masses, walls_move
         whole = [(run, range(len(run))) for run in runs]
         single = [(run, range(k, k + 1)) for run in runs for k in range(len(run))]
         self._parts = single if separate else whole
-        self._separate = separate
+        self._separate, self._frame_dt = separate, frame_dt
         self._last: tuple[int, ParticleArrays] | None = None
 
     @property
@@ -87,14 +89,18 @@ class ImportedTrajectories(Sequence[ParticleArrays]):
         )
 
     def _velocities(self, frames: Sequence[Particles], solids: Sequence[Particles]) -> np.ndarray | None:
-        if any("velocity" not in each.values for each in (*frames, *solids)):
+        """Velocities (T, N, D); those of moving walls are differences where their files hold none."""
+        if any("velocity" not in each.values for each in frames):
             return None
-        return np.stack(
-            [
-                np.concatenate([self._vectors(each.values["velocity"], each) for each in parts])
-                for parts in (zip(frames, solids, strict=True) if solids else zip(frames, strict=True))
-            ]
-        )
+        fluid = np.stack([self._vectors(each.values["velocity"], each) for each in frames])
+        if not solids:
+            return fluid
+        if all("velocity" in each.values for each in solids):
+            moving = np.stack([self._vectors(each.values["velocity"], each) for each in solids])
+        else:
+            positions = np.stack([each.positions for each in solids])[..., self._axes]
+            moving = np.gradient(positions, self._frame_dt, axis=0).astype(positions.dtype)
+        return np.concatenate([fluid, moving], axis=1)
 
     def _vectors(self, values: np.ndarray, of: Particles | None) -> np.ndarray:
         """Components of vectors (N, C) on the axes that are kept."""

@@ -161,16 +161,32 @@ def test_still_walls_are_boundary_points_with_unit_normals(tmp_path):
     assert plan.found["boundary"] == "5 points, still, with normals"
 
 
-def test_moving_walls_are_particles_that_move(tmp_path):
-    pattern = write_series(tmp_path / "fluid", "numpy.npz")
-    (tmp_path / "wall").mkdir()
+def write_moving_walls(folder, told=True):
+    """A wall in each of nine files that moves along x, and perhaps its velocity."""
+    folder.mkdir()
     for k in range(9):
-        velocity = {"velocity": np.tile([0.01 / DT, 0.0, 0.0], (5, 1))}
-        np.savez(tmp_path / "wall" / f"wall_{k}.npz", **wall(0.01 * k), **velocity)
+        velocity = {"velocity": np.tile([0.01 / DT, 0.0, 0.0], (5, 1))} if told else {}
+        np.savez(folder / f"wall_{k}.npz", **wall(0.01 * k), **velocity)
+
+
+def test_a_wall_that_grows_is_no_sequence(tmp_path):
+    pattern = write_series(tmp_path / "fluid", "numpy.npz")
+    write_moving_walls(tmp_path / "wall")
+    np.savez(tmp_path / "wall" / "wall_5.npz", positions=np.zeros((3, 3)))
+    with pytest.raises(DataError, match="wall_5.npz: has 3 particles, wall_0.npz has 5"):
+        imported(tmp_path, [pattern], walls=[str(tmp_path / "wall" / "*.npz")], dt=DT)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_moving_walls_are_particles_that_move(tmp_path, told):
+    pattern = write_series(tmp_path / "fluid", "numpy.npz")
+    write_moving_walls(tmp_path / "wall", told)
     dataset, _ = imported(tmp_path, [pattern], walls=[str(tmp_path / "wall" / "*.npz")], dt=DT)
     part = dataset.trajectory("train", 0)
     moving = part.particle_types == ParticleType.MOVING_WALL
     assert int(moving.sum()) == 5
+    np.testing.assert_allclose(part.velocities[1, moving], [[0.01 / DT, 0.0]] * 5, rtol=1e-5)
+    np.testing.assert_allclose(part.velocities[1, ~moving], moving_lattice()[1]["velocity"][:, :2])
     np.testing.assert_allclose(part.positions[2, moving], wall(0.02)["positions"][:, :2], rtol=1e-6)
     assert any(line.startswith("moving walls: ") for line in dataset.scene.missing)
     separate, _ = imported(
