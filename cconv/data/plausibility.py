@@ -399,7 +399,7 @@ def _number_density(fluid: _Fluid) -> _Seen | None:
             fits = fluid.scene.particle_spacing * packed ** (-1 / fluid.scene.dim)
             text = (
                 f"the fluid is {packed:.3g} times as dense as its particle spacing {fluid.scene.particle_spacing:g} "
-                f"says; a spacing of {fits:.3g} fits: give --particle-spacing, and --mass if masses follow from it"
+                f"says; give --particle-spacing {fits:.3g}, unless the simulation compresses it so"
             )
             return _Seen(frame, None, text)
     return None
@@ -423,10 +423,12 @@ def _compressed(fluid: _Fluid) -> _Seen | None:
 
 def _jumps(fluid: _Fluid) -> _Seen | None:
     """Steps beyond a spacing that stored velocities do not explain: another order of particles, or an explosion."""
-    if fluid.scene.velocity_source != STORED or len(fluid.steps) == 0 or _velocities(fluid) is not None:
+    if fluid.scene.velocity_source != STORED or len(fluid.steps) == 0:
         return None
     said = torch.maximum(fluid.speeds[1:], fluid.speeds[:-1]) * fluid.scene.frame_dt
     moved = torch.linalg.vector_norm(fluid.steps, dim=-1)
+    if (moved > JUMP * said).double().mean() > HALF:
+        return None  # velocities of other units, or none, which are no jumps
     seen = _first_beyond(
         moved / torch.maximum(JUMP * said, torch.full_like(said, fluid.scene.particle_spacing)),
         1.0,
