@@ -69,7 +69,7 @@ def plan_import(
         DataError: If files are missing, damaged, or do not fit each other.
         ConfigError: If something must be given that the files do not tell.
     """
-    reader = Reader()
+    reader = Reader(progress)
     runs = find_runs(patterns, phases, walls, reader)
     _check_enough(runs, settings)
     frames = FrameReader(reader, settings.mapping, settings.types, settings.fluid)

@@ -34,25 +34,25 @@ class FrameReader:
 
     def fluid_of(self, run: Run, k: int) -> Particles:
         """Particles of the fluid's files, those of walls among them included."""
-        return joined([self._particles(ref, self.types, self.fluid) for ref in run.fluid[k]])
+        return joined([self._fluid(ref) for ref in run.fluid[k]])
 
     def walls_of(self, run: Run, k: int) -> Particles | None:
         """Particles of the walls' files, or None."""
-        parts = [self._particles(ref, {}, None) for ref in run.walls[k]]
+        parts = [self._wall(ref) for ref in run.walls[k]]
         return joined(parts) if parts else None
 
     def fields(self, ref: FrameRef) -> dict[str, tuple[str, ...]]:
-        """Names of the arrays that hold each field."""
+        """Names of the arrays that hold each field of the fluid."""
         return find_fields(self.reader.table(ref), self.mapping)
 
-    def _particles(self, ref: FrameRef, types: Types | None, fluid: int | None) -> Particles:
-        is_fluid = types != {}
+    def _fluid(self, ref: FrameRef) -> Particles:
+        return particles_of(self.reader.table(ref), self.fields(ref), self.types, self.fluid)
+
+    def _wall(self, ref: FrameRef) -> Particles:
+        """Particles of a file that holds nothing but walls, whose names of fields may be the fluid's."""
         table = self.reader.table(ref)
-        mapping = self.mapping if is_fluid else {n: s for n, s in self.mapping.items() if set(s) <= set(table.arrays)}
-        fields = find_fields(table, mapping)
-        if not is_fluid:
-            fields.pop("type", None)
-        return particles_of(table, fields, types, fluid)
+        mapping = {field: names for field, names in self.mapping.items() if {*names} <= {*table.arrays}}
+        return particles_of(table, find_fields(table, mapping | {"type": ()}), None, None)
 
 
 @dataclass(frozen=True)

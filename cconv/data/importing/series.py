@@ -4,7 +4,7 @@ import glob
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +12,12 @@ from typing import NamedTuple
 from cconv.data.importing.formats import READERS, read_tables
 from cconv.data.importing.table import Table
 from cconv.data.importing.vtk_xml import read_collection
-from cconv.data.limits import one_line
+from cconv.data.limits import memory_limit, one_line
 from cconv.errors import DataError
 from cconv.files import read_json
 
 COLLECTION, SERIES = ".pvd", ".series"  # files that name others
+SHARE = 4  # of the memory that data may take is for files that were read
 IRREGULAR = 0.01  # largest difference of two intervals that count as one, relative to them
 
 
@@ -64,17 +65,29 @@ class FrameRef:
 
 
 class Reader:
-    """Reads frames; keeps the last file, as neighbouring frames often lie in one."""
+    """Reads frames; keeps what it read as long as there is plenty of memory, as an import looks at files several times.
 
-    def __init__(self) -> None:
-        self._file: Path | None = None
-        self._tables: list[Table] = []
+    Args:
+        progress: Wraps files to show progress, given a label.
+    """
+
+    def __init__(self, progress: Callable[[Iterable, str], Iterable] = lambda items, label: items):
+        self.progress = progress
+        self._room = memory_limit() // SHARE
+        self._kept: dict[Path, list[Table]] = {}
+        self._last: tuple[Path, list[Table]] | None = None
 
     def tables(self, file: Path) -> list[Table]:
         """All frames of a file."""
-        if file != self._file:
-            self._tables, self._file = read_tables(file), file
-        return self._tables
+        if file in self._kept:
+            return self._kept[file]
+        if self._last is None or self._last[0] != file:
+            self._last = file, read_tables(file)
+            size = sum(values.nbytes for table in self._last[1] for values in table.arrays.values())
+            if size <= self._room:
+                self._room -= size
+                self._kept[file] = self._last[1]
+        return self._last[1]
 
     def table(self, ref: FrameRef) -> Table:
         """One frame."""
@@ -109,7 +122,7 @@ def frames_of(series: Series, reader: Reader) -> list[list[FrameRef]]:
     """
     counts = {}
     frames: list[list[FrameRef]] = []
-    for entry in series.entries:
+    for entry in reader.progress(series.entries, "read files"):
         tables = reader.tables(entry.file)
         counts[entry.file] = len(tables)
         times = [table.time if entry.time is None else entry.time for table in tables]
