@@ -189,8 +189,8 @@ def check(
 
     Every trajectory is read. Suspicious data are a warning each, with trajectory, frame and particle, and what to do: a
     spacing that does not fit, particles without neighbours, jumps, clumps, particles outside the box or at the same
-    place, fields that hardly differ. Data from which nothing can be learned end in exit status 2, and no study takes
-    them.
+    place, fields that hardly differ. Data from which nothing can be learned end in one line and
+    exit status 2, and no study takes them.
     """
     from cconv.data.plausibility import dataset_findings, refuse_nonsense
     from cconv.tasks import field_tasks
@@ -202,11 +202,10 @@ def check(
         findings += field_findings(dataset, field_tasks())
     if as_json:
         print_json([finding.as_dict() for finding in findings])
-    elif findings:
-        print_findings(finding for finding in findings if not finding.stops)
-    else:
-        results.print("nothing suspicious found")
     refuse_nonsense(findings)
+    if not as_json:
+        print_findings(findings)
+        results.print(f"{len(findings) or 'nothing'} suspicious found")
 
 
 @app.command()

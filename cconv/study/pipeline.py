@@ -198,8 +198,8 @@ def _described_data(
     """
     dataset = open_study_data(study.data, study.seeds.data)
     findings = dataset_findings(dataset, progress)
-    observer.on_data([str(finding) for finding in findings])
     refuse_nonsense(findings)
+    observer.on_data([str(finding) for finding in findings])
     described = describe_environment(study, dataset, workers)
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     return dataset

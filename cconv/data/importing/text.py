@@ -23,10 +23,14 @@ def read_text_table(file: Path) -> list[Table]:
         DataError: If it has no names of columns, or no rows.
     """
     check_size(COPIES * file.stat().st_size, file.stat().st_size, str(file))
-    header, separator = _header(file)
+    header, separator, ends = _header(file)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        frame = pd.read_csv(file, sep=separator, skipinitialspace=True, header=0, names=header, index_col=False)
+        # Values beyond the last name are a warning; what follows a separator at the end of every line is none.
+        warnings.simplefilter("ignore" if ends else "error", pd.errors.ParserWarning)
+        try:
+            frame = pd.read_csv(file, sep=separator, skipinitialspace=True, header=0, names=header, index_col=False)
+        except pd.errors.ParserWarning as warning:
+            raise DataError(f"{file}: has more values in a row than its first line has names; correct it.") from warning
     if frame.empty:
         raise DataError(f"{file}: has no rows; copy it again.")
     column = next((name for name in header if is_time(name)), None)
@@ -41,16 +45,18 @@ def read_text_table(file: Path) -> list[Table]:
     ]
 
 
-def _header(file: Path) -> tuple[list[str], str]:
-    """Names in the first line, without units in brackets, and what separates them."""
+def _header(file: Path) -> tuple[list[str], str, bool]:
+    """Names in the first line, without units in brackets, what separates them, and whether it ends the line too."""
     with file.open(encoding="utf-8-sig") as stream:
         line = stream.readline(LONGEST_LINE).strip().lstrip("#").strip()
     separator = next((each for each in SEPARATORS if each in line), r"\s+")
+    ends = line.endswith(separator)
+    line = line.removesuffix(separator)
     parts = line.split() if separator == r"\s+" else line.split(separator)
     names = [part.partition("[")[0].strip().strip('"') if " [" in part else part.strip().strip('"') for part in parts]
     if len(set(names)) < len(names) or not all(names) or all(map(_is_number, names)):
         raise DataError(f"{file}: its first line must name the columns, each once, such as x,y,vx,vy; add it.")
-    return names, separator
+    return names, separator, ends
 
 
 def _is_number(text: str) -> bool:

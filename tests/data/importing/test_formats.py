@@ -77,6 +77,29 @@ def test_units_and_comment_signs_in_the_first_line_are_no_part_of_names(tmp_path
     assert list(table.arrays) == ["Pos.x", "Pos.z", "Rhop"]
 
 
+def test_a_separator_may_end_the_lines(tmp_path):
+    (tmp_path / "a.csv").write_text("x;y;\n0;1;\n1;2;\n")
+    (table,) = read_tables(tmp_path / "a.csv")
+    assert table.arrays["y"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x,y\n0,1,2\n1,2,3\n", "more values in a row"),
+        ("x,y\n0,1\n1,2,3\n", "line 3"),
+        ("0,1\n1,2\n", "first line must name the columns"),
+        ("x,x\n0,1\n", "each once"),
+        ("x,y\n", "no rows"),
+        ("x,t\n0,a\n", "`t` must be a number in every row"),
+    ],
+)
+def test_tables_that_do_not_fit_their_first_line_are_refused(tmp_path, text, words):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(DataError, match=words):
+        read_tables(tmp_path / "a.csv")
+
+
 def test_arrays_with_an_axis_of_time_are_frames(tmp_path):
     positions = np.random.default_rng(0).random((5, 7, 2))
     np.savez(tmp_path / "run.npz", positions=positions, time=0.1 * np.arange(5), mass=np.ones(7))
