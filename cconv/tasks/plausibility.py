@@ -7,6 +7,8 @@ import torch
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import DataFinding
 from cconv.data.splits import evenly_spaced
+from cconv.data.trajectory import Trajectory
+from cconv.errors import ConfigError
 from cconv.tasks.samples import Sample, make_sample
 from cconv.tasks.task import FieldTask, Task
 
@@ -33,7 +35,7 @@ def target_findings(samples: Sequence[Sample], task: Task, stops: bool) -> list[
     first = samples[0]
     return [
         DataFinding(
-            check=f"target_{task.name}",
+            check=_name(task),
             trajectory=first.trajectory,
             frame=first.frame,
             particle=None,
@@ -54,10 +56,23 @@ def field_findings(dataset: Dataset, tasks: Sequence[FieldTask]) -> list[DataFin
         DataError: If the data are damaged.
     """
     chosen = [dataset.trajectory("train", k) for k in evenly_spaced(len(dataset.splits["train"]), FRAMES)]
-    found = []
-    for task in tasks:
+    return [finding for task in tasks for finding in _of_field(dataset, task, chosen)]
+
+
+def _of_field(dataset: Dataset, task: FieldTask, chosen: Sequence[Trajectory]) -> list[DataFinding]:
+    """Findings about a field in the last frames of some trajectories, one of them if it cannot be computed there."""
+    try:
         samples = [
             make_sample(each[-1], dataset.scene, task, each.name, each.first_frame + len(each) - 1) for each in chosen
         ]
-        found += target_findings(samples, task, stops=False)
-    return found
+    except ConfigError as error:
+        text = f"the task {task.name!r} cannot be asked of these data: {error}"
+        first = chosen[0]
+        return [
+            DataFinding(check=_name(task), trajectory=first.name, frame=first.first_frame, particle=None, text=text)
+        ]
+    return target_findings(samples, task, stops=False)
+
+
+def _name(task: Task) -> str:
+    return f"target_{task.name}"

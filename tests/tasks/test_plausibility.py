@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from particle_files import write_hdf5
 from systems import periodic_frame, periodic_scene
 
 from cconv.data.dataset import open_dataset
@@ -36,3 +37,9 @@ def test_a_fluid_that_moves_and_is_disordered_teaches_something(generator, task)
 
 def test_fields_of_a_simulation_teach_something(flow_folder):
     assert field_findings(open_dataset(flow_folder), field_tasks()) == []
+
+
+def test_a_field_whose_kernel_does_not_fit_the_box_is_told(tmp_path):
+    write_hdf5(tmp_path, {"bounds": [[0.0, 1.0], [0.0, 1.0]], "dx": 0.4})
+    findings = field_findings(open_dataset(tmp_path), [task_named("density_rate")])
+    assert ["cannot be asked of these data: `cutoff` must be at most half" in str(each) for each in findings] == [True]

@@ -21,7 +21,11 @@ SINGLY = "import frames singly with --separate-frames, for tasks that ask for fi
 
 
 def axes_of(scans: Sequence[RunScan]) -> list[int]:
-    """Axes along which particles differ in any frame; data of two dimensions are often stored with a third."""
+    """Axes along which particles differ in any frame; data of two dimensions are often stored with a third.
+
+    Raises:
+        DataError: If there are none.
+    """
     lower, upper = np.min([scan.lower for scan in scans], axis=0), np.max([scan.upper for scan in scans], axis=0)
     axes = np.flatnonzero(upper > lower).tolist()
     if not axes:
@@ -30,6 +34,17 @@ def axes_of(scans: Sequence[RunScan]) -> list[int]:
 
 
 def spacing_of(first: Particles, axes: Sequence[int], settings: ImportSettings) -> tuple[float, str]:
+    """Particle spacing and where it comes from: given, stored, or the median distance of nearest neighbours.
+
+    Args:
+        first: Particles of the first frame.
+        axes: Axes that are kept.
+        settings: What the user says.
+
+    Raises:
+        ConfigError: If a single particle does not tell it.
+        DataError: If particles lie at the place of others.
+    """
     if settings.particle_spacing is not None:
         return settings.particle_spacing, GIVEN
     if "spacing" in first.values:
@@ -51,9 +66,11 @@ def frame_dt_of(runs: Sequence[Run], scans: Sequence[RunScan], settings: ImportS
         ConfigError: If nothing tells the time.
     """
     intervals: list[float] = []
+    is_irregular = False
     for run, scan in zip(runs, scans, strict=True):
         refs = run.times if settings.dt is None else [replace(ref, time=None) for ref in run.times]
         times, gap = interval(refs, settings.name_time)
+        is_irregular = is_irregular or gap is not None
         if not settings.separate_frames:
             if gap is not None:
                 raise DataError(f"{gap}; add the missing files, name fewer, or {SINGLY}.")
@@ -70,7 +87,7 @@ def frame_dt_of(runs: Sequence[Run], scans: Sequence[RunScan], settings: ImportS
                 "import runs of one interval."
             )
         source = "numbers in file names" if settings.name_time else "times in the files"
-        return float(f"{np.median(intervals):.9g}"), source
+        return float(f"{np.median(intervals):.9g}"), source + (", irregular: the median" if is_irregular else "")
     if settings.separate_frames:
         return 1.0, "not known; 1 stands for it, as single frames do not need it"
     raise ConfigError(
@@ -80,7 +97,18 @@ def frame_dt_of(runs: Sequence[Run], scans: Sequence[RunScan], settings: ImportS
 
 
 def box_of(scans: Sequence[RunScan], axes: Sequence[int], spacing: float, settings: ImportSettings) -> Box:
-    letters = [letter for letter in settings.periodic.replace(",", "").replace(" ", "")]
+    """The box that is given, or an open one around all particles and walls, half a spacing wider.
+
+    Args:
+        scans: What was found in the runs.
+        axes: Axes that are kept.
+        spacing: Particle spacing.
+        settings: What the user says.
+
+    Raises:
+        ConfigError: If a periodic axis is not one of the data, or has no bounds.
+    """
+    letters = settings.periodic.replace(",", "").replace(" ", "")
     unknown = [letter for letter in letters if letter not in [AXES[axis] for axis in axes]]
     if unknown:
         kept = ", ".join(AXES[axis] for axis in axes)
@@ -96,7 +124,11 @@ def box_of(scans: Sequence[RunScan], axes: Sequence[int], spacing: float, settin
 
 
 def on_axes(values: tuple | None, axes: Sequence[int], option: str) -> tuple | None:
-    """Values of the axes that are kept, of values for these or for all that the files have."""
+    """Values of the axes that are kept, of values for these or for all that the files have.
+
+    Raises:
+        ConfigError: If there are too few of them.
+    """
     if values is None or len(values) == len(axes):
         return values
     if len(values) <= max(axes):

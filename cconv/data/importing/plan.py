@@ -7,12 +7,11 @@ from pathlib import Path
 from cconv.data.arrays import ParticleArrays, SceneFacts, split_runs, write_runs
 from cconv.data.importing.facts import AXES, GIVEN, IN_FILES, axes_of, box_of, frame_dt_of, on_axes, spacing_of
 from cconv.data.importing.masses import Masses
-from cconv.data.importing.particles import Particles
 from cconv.data.importing.runs import Run, find_runs
 from cconv.data.importing.scan import FrameReader, RunScan, count_of, scan_runs
 from cconv.data.importing.series import Reader
 from cconv.data.importing.settings import ImportSettings
-from cconv.data.importing.trajectories import ImportedTrajectories
+from cconv.data.importing.trajectories import ImportedTrajectories, components_on
 from cconv.data.limits import one_line
 from cconv.data.source import STORED
 from cconv.data.trajectory import ParticleType
@@ -80,8 +79,7 @@ def plan_import(
     masses = Masses.of(scans[0].first, settings.mass, spacing ** len(axes))
     walls_move = any(scan.walls_move for scan in scans)
     trajectories = ImportedTrajectories(runs, frames, axes, masses, settings.separate_frames, walls_move, frame_dt)
-    if settings.separate_frames:
-        _check_velocities(scans[0].first)
+    _check_vectors(scans, axes, settings)
     missing = _missing(scans[0], settings, spacing_from, dt_from, masses, walls_move)
     scene = SceneFacts(
         particle_spacing=spacing,
@@ -107,8 +105,14 @@ def _check_enough(runs: Sequence[Run], settings: ImportSettings) -> None:
     split_runs([run.name for run in runs], lambda k: len(runs[k]), split, runs[0].times[0].file.parent)
 
 
-def _check_velocities(first: Particles) -> None:
-    if "velocity" not in first.values:
+def _check_vectors(scans: Sequence[RunScan], axes: list[int], settings: ImportSettings) -> None:
+    """Check that vectors have the components of positions, and that there are velocities where frames are separate."""
+    for particles in (each for scan in scans for each in (scan.first, scan.walls) if each is not None):
+        for name in ("velocity", "normal"):
+            if name in particles.values:
+                components_on(axes, particles.values[name], particles)
+    first = scans[0].first
+    if settings.separate_frames and "velocity" not in first.values:
         raise DataError(
             f"{first.file}: has no velocities, and single frames do not tell them; say what they are with --map "
             "velocity=NAME, or import frames at one interval without --separate-frames."

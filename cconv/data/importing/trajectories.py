@@ -75,7 +75,8 @@ class ImportedTrajectories(Sequence[ParticleArrays]):
         frames = [self._frames.fluid_of(run, k) for k in chosen]
         moving = [self._frames.walls_of(run, k) for k in chosen] if joins_walls else []
         solids = [each for each in moving if each is not None]
-        normals = None if walls is None or joins_walls else walls.values.get("normal")
+        still = None if joins_walls else walls
+        normals = None if still is None else still.values.get("normal")
         viscosities = first.values.get("viscosity")
         added = len(solids[0]) if solids else 0
         return ParticleArrays(
@@ -84,37 +85,43 @@ class ImportedTrajectories(Sequence[ParticleArrays]):
             masses=self._masses.values(first, added),
             particle_types=np.append(first.types, np.full(added, int(ParticleType.MOVING_WALL))),
             viscosities=None if viscosities is None or added else viscosities,
-            boundary_positions=None if walls is None or joins_walls else walls.positions[:, self._axes],
-            boundary_normals=None if normals is None else _unit(self._vectors(normals, walls)),
+            boundary_positions=None if still is None else still.positions[:, self._axes],
+            boundary_normals=None
+            if still is None or normals is None
+            else _unit(components_on(self._axes, normals, still)),
         )
 
     def _velocities(self, frames: Sequence[Particles], solids: Sequence[Particles]) -> np.ndarray | None:
         """Velocities (T, N, D); those of moving walls are differences where their files hold none."""
         if any("velocity" not in each.values for each in frames):
             return None
-        fluid = np.stack([self._vectors(each.values["velocity"], each) for each in frames])
+        fluid = np.stack([components_on(self._axes, each.values["velocity"], each) for each in frames])
         if not solids:
             return fluid
         if all("velocity" in each.values for each in solids):
-            moving = np.stack([self._vectors(each.values["velocity"], each) for each in solids])
+            moving = np.stack([components_on(self._axes, each.values["velocity"], each) for each in solids])
         else:
             positions = np.stack([each.positions for each in solids])[..., self._axes]
             moving = np.gradient(positions, self._frame_dt, axis=0).astype(positions.dtype)
         return np.concatenate([fluid, moving], axis=1)
 
-    def _vectors(self, values: np.ndarray, of: Particles | None) -> np.ndarray:
-        """Components of vectors (N, C) on the axes that are kept."""
-        if values.shape[1] == len(self._axes):
-            return values
-        components = values.shape[1] if of is None else of.positions.shape[1]
-        if values.shape[1] > components and not values[:, components:].any():
-            values = values[:, :components]  # a third component that is always zero
-        if of is not None and values.shape[1] != components:
-            raise DataError(
-                f"{of.file}: vectors have {values.shape[1]} components, positions {components}; write "
-                "both with as many."
-            )
-        return values[:, self._axes]
+
+def components_on(axes: Sequence[int], values: np.ndarray, of: Particles) -> np.ndarray:
+    """Components of vectors (N, C) of particles on the axes that are kept, (N, D).
+
+    Raises:
+        DataError: If they have another number of components than the positions, or than there are axes.
+    """
+    components = of.positions.shape[1]
+    if values.shape[1] == len(axes):
+        return values
+    if values.shape[1] > components and not values[:, components:].any():
+        values = values[:, :components]  # a third component that is always zero
+    if values.shape[1] != components:
+        raise DataError(
+            f"{of.file}: vectors have {values.shape[1]} components, positions {components}; write both with as many."
+        )
+    return values[:, axes]
 
 
 def _stacked(frames: Sequence[np.ndarray], solids: Sequence[np.ndarray], axes: list[int]) -> np.ndarray:

@@ -138,6 +138,22 @@ def test_particles_enter_and_leave_in_frames_of_their_own(tmp_path):
     assert "for fields, not for steps" in plan.found["written as"]
 
 
+def test_single_frames_do_not_tell_velocities(tmp_path):
+    frames = [{"positions": frame["positions"]} for frame in moving_lattice()]
+    with pytest.raises(DataError, match="numpy_0.npz: has no velocities, and single frames do not tell them"):
+        imported(tmp_path, [write_series(tmp_path, "numpy.npz", frames)], separate_frames=True)
+
+
+def test_irregular_times_are_those_of_single_frames(tmp_path):
+    for k, frame in enumerate(moving_lattice()):
+        write_appended(tmp_path / f"a_{k}.vtu", frame, time=DT * k * k)
+    with pytest.raises(DataError, match="a_2.vtu: time 1 follows 0.25.*--separate-frames"):
+        imported(tmp_path, [str(tmp_path / "a_*.vtu")])
+    dataset, plan = imported(tmp_path, [str(tmp_path / "a_*.vtu")], separate_frames=True)
+    assert "irregular: the median" in plan.found["time between frames"]
+    assert len(dataset.splits["train"]) == 3
+
+
 def test_other_particles_of_the_same_number_are_no_sequence(tmp_path):
     frames = moving_lattice()
     frames[4] = frames[4] | {"id": frames[4]["id"] + 3}
@@ -279,6 +295,13 @@ def of_other_dimensions(frames):
     return r"numpy_6.npz: has 2 dimensions, numpy_0.npz has 3"
 
 
+def of_fewer_components(frames):
+    for frame in frames:
+        frame["positions"][:, 2] = frame["positions"][:, 0]
+        frame["velocity"] = frame["velocity"][:, :2]
+    return r"numpy_0.npz: vectors have 2 components, positions 3"
+
+
 def of_another_spacing(frames):
     for k, frame in enumerate(frames):
         frame["particle_spacing"] = np.full(16, 0.1 if k != 6 else 0.2)
@@ -292,7 +315,16 @@ def with_other_types(frames):
 
 
 @pytest.mark.parametrize(
-    "damage", [blown_up, of_another_length, lacking, of_other_dimensions, of_another_spacing, with_other_types]
+    "damage",
+    [
+        blown_up,
+        of_another_length,
+        lacking,
+        of_other_dimensions,
+        of_fewer_components,
+        of_another_spacing,
+        with_other_types,
+    ],
 )
 def test_a_frame_that_does_not_fit_is_named(tmp_path, damage):
     frames = moving_lattice()
