@@ -9,10 +9,13 @@ _HOMES = {
     "Box": "cconv.domain",
     "Dataset": "cconv.data.dataset",
     "Edges": "cconv.neighbors",
+    "ParticleArrays": "cconv.data.arrays",
+    "SceneFacts": "cconv.data.arrays",
     "fit_closed_form": "cconv.models.closed_form",
     "load_model": "cconv.models.checkpoint",
     "open_dataset": "cconv.data.dataset",
     "radius_graph": "cconv.neighbors",
+    "write_dataset": "cconv.data.arrays",
 }
 __all__ = list(_HOMES)
 

@@ -1,6 +1,8 @@
 import json
 
 import pytest
+from conftest import SMOKE
+from foreign_files import moving_lattice, write_series
 from outcomes import assert_one_clear_line
 from particle_files import record_frames, write_hdf5, write_parts
 
@@ -159,3 +161,85 @@ def test_help_is_given(cconv, command):
     status, out, _ = cconv(*command, "--help")
     assert status == 0
     assert "Usage" in out
+
+
+def test_files_are_imported_and_what_they_were_taken_for_is_said(cconv, tmp_path):
+    pattern = write_series(tmp_path, "semicolon.csv")
+    status, out, error = cconv("data", "import", pattern, "--out", tmp_path / "a", "--dt", 0.25, "--force", "0,-9.81,0")
+    assert (status, error) == (0, "")
+    for words in ("`vx` + `vy` + `vz`", "`rho`", "z never differs", "0.25 (given)", "boundary: no walls found"):
+        assert words in out
+    scene = open_dataset(tmp_path / "a").scene
+    assert (scene.dim, scene.force) == (2, ConstantForce((0.0, -9.81)))
+    status, out, _ = cconv("data", "inspect", tmp_path / "a", "--json")
+    assert json.loads(out)["splits"]["train"]["frames"] == 3
+
+
+def test_an_import_tells_programs_what_it_found(cconv, tmp_path):
+    pattern = write_series(tmp_path, "numpy.npz")
+    said = ["--separate-frames", "--gap", 0, "--bounds", "-1:2,-1:2,0:1", "--periodic", "x", "--types", "0=fluid"]
+    status, out, _ = cconv("data", "import", pattern, "--out", tmp_path / "a", *said, "--json")
+    assert status == 0
+    assert json.loads(out)["found"]["velocity"] == "`velocity`"
+    assert open_dataset(tmp_path / "a").scene.box.periodic == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ([], ["--dt", "--name-time"]),
+        (["--dt", 0.25, "--map", "velocity=vel"], ["semicolon_0.csv: has no 'vel' for the velocity"]),
+        (["--dt", 0.25, "--types", "1"], ["--types"]),
+        (["--dt", 0.25, "--bounds", "0-1"], ["`--bounds` must be LOW:HIGH"]),
+        (["--dt", 0.25, "--bounds", "1:0,0:1"], ["lower bound below the upper"]),
+        (["--dt", -1], ["`frame_dt` must be positive"]),
+        (["--dt", 0.25, "--particle-spacing", 0], ["`particle_spacing` must be positive"]),
+        (["--dt", 0.25, "--boundary", "none*.vtp"], ["none*.vtp: no file matches"]),
+    ],
+)
+def test_import_refuses_in_one_line_and_writes_nothing(cconv, tmp_path, said, words):
+    pattern = write_series(tmp_path / "files", "semicolon.csv")
+    assert_one_clear_line(cconv("data", "import", pattern, "--out", tmp_path / "a", *said), *words)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["files"]
+
+
+def test_import_does_not_replace_what_is_there(cconv, tmp_path):
+    pattern = write_series(tmp_path / "files", "semicolon.csv")
+    arguments = ["data", "import", pattern, "--out", tmp_path / "a", "--dt", 0.25]
+    assert cconv(*arguments)[0] == 0
+    assert_one_clear_line(cconv(*arguments), "exists and is not empty")
+    assert cconv(*arguments, "--overwrite")[0] == 0
+
+
+def test_names_in_files_are_shown_as_they_are(cconv, tmp_path):
+    frames = [frame | {"[red]\x1b[31m": frame["id"]} for frame in moving_lattice()]
+    pattern = write_series(tmp_path, "numpy.npz", frames)
+    status, out, _ = cconv("data", "import", pattern, "--out", tmp_path / "a", "--dt", 0.25)
+    assert status == 0
+    assert "[red]" in out
+    assert "\x1b" not in out
+
+
+def test_check_finds_nothing_in_a_simulation(cconv, flow_folder):
+    assert cconv("data", "check", flow_folder) == (0, "nothing suspicious found\n", "")
+
+
+def test_check_warns_of_what_is_suspicious(cconv, flow_folder):
+    status, out, error = cconv("data", "check", flow_folder, "--particle-spacing", 0.08)
+    assert status == 0
+    assert out == f"{error.count('cconv: suspicious data: trajectory train/0000')} suspicious found\n"
+    assert "1 suspicious" in out or "2 suspicious" in out
+    status, out, _ = cconv("data", "check", flow_folder, "--particle-spacing", 0.08, "--json")
+    assert "number_density" in [finding["check"] for finding in json.loads(out)]
+
+
+def test_check_and_study_refuse_what_makes_no_sense(cconv, flow_folder, tmp_path):
+    wrong = ["--particle-spacing", 0.001]
+    words = ["the data make no sense: trajectory train/0000", "have no neighbour within 0.002", "--particle-spacing"]
+    assert_one_clear_line(cconv("data", "check", flow_folder, *wrong), *words)
+    study = SMOKE.read_text().replace("../search_spaces", str(SMOKE.parents[1] / "search_spaces"))
+    (tmp_path / "study.toml").write_text(f"{study}\n[data]\nparticle_spacing = 0.001\n")
+    out = tmp_path / "run"
+    run = cconv("study", "run", tmp_path / "study.toml", "--data", flow_folder, "--out", out, "--serial")
+    assert_one_clear_line(run, *words)
+    assert not list((out / "trials").glob("*"))

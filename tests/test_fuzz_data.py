@@ -14,6 +14,7 @@ import msgpack
 import numpy as np
 import pytest
 import zstandard
+from foreign_files import WRITERS, write_series
 from fuzzing import changed, changed_bytes, changed_json, check_call, examples, numbers, strings
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -26,6 +27,7 @@ MEMBERS = ("position", "particle_type", "velocity", "mass", "viscosity", "bounda
 GIVEN = ("--mass", "--particle-spacing", "--frame-dt", "--force")
 COMMANDS = {
     "inspect": ("--cutoff", *GIVEN),
+    "check": GIVEN,
     "convert": GIVEN,
     "show": ("--frames", "--every", "--split", "--trajectory", "--color", "--mass"),
 }
@@ -207,6 +209,46 @@ def test_a_changed_folder_is_read_or_refused_in_one_line(folders, kind, data):
 @given(data=st.data())
 def test_any_option_is_taken_or_refused_in_one_line(folders, kind, data):
     try_data(folders / kind, lambda *_: None, data)
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory):
+    """Files of each kind that other programs write: pattern, and contents by file."""
+    place = tmp_path_factory.mktemp("fuzz_foreign")
+    patterns = {kind: write_series(place / kind.replace(".", "_"), kind) for kind in WRITERS}
+    return place, {
+        kind: (pattern, {file: file.read_bytes() for file in sorted((place / kind.replace(".", "_")).iterdir())})
+        for kind, pattern in patterns.items()
+    }
+
+
+def try_files(foreign, kind, data):
+    place, files = foreign
+    pattern, contents = files[kind]
+    file = data.draw(st.sampled_from(sorted(contents)))
+    file.write_bytes(data.draw(changed_bytes(contents[file])))
+    try:
+        status = check_call("data", "import", pattern, "--dt", 0.25, "--out", place / "out")
+        assert (place / "out").exists() == (status == 0)
+    finally:
+        shutil.rmtree(place / "out", ignore_errors=True)
+        file.write_bytes(contents[file])
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@examples(4)
+@given(data=st.data())
+def test_a_changed_file_of_another_program_is_imported_or_refused_in_one_line(foreign, kind, data):
+    try_files(foreign, kind, data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("kind", WRITERS)
+@examples(200)
+@given(data=st.data())
+def test_hundreds_of_files_of_other_programs(foreign, kind, data):
+    try_files(foreign, kind, data)
 
 
 @pytest.mark.parametrize("content", BOMBS, ids=lambda content: repr(content[:6]))

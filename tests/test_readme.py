@@ -20,15 +20,16 @@ def test_the_code_blocks_run(flow_folder, steps_folder, tmp_path):
     save_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), tmp_path / "model", {})
     save_model(untrained_step(steps_folder), tmp_path / "step", {})
     blocks = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     code = "\n".join(blocks)
     places = {"FOLDER": flow_folder, CHECKPOINT: tmp_path / "model"}
-    places |= {"VORTICES": steps_folder, STEP_CHECKPOINT: tmp_path / "step"}
+    places |= {"MINE": tmp_path / "mine", "VORTICES": steps_folder, STEP_CHECKPOINT: tmp_path / "step"}
     for placeholder, path in places.items():
         assert f'"{placeholder}"' in code
         code = code.replace(f'"{placeholder}"', repr(str(path)))
     names = {}
     exec(compile(code, "README.md", "exec"), names)
+    assert [len(cconv.open_dataset(tmp_path / "mine").trajectory(split, 0)) for split in ("train", "test")] == [40, 8]
     assert names["features"].shape == (1000, 16)
     assert names["output"].shape == (1000, 1)
     assert names["frame"].positions.shape[1] == 2

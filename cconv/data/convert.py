@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from cconv.data.dataset import Dataset
-from cconv.data.hdf5 import write_dataset
+from cconv.data.hdf5 import write_splits
 from cconv.data.trajectory import Trajectory
 
 
@@ -30,7 +30,7 @@ def convert(
         DataError: If the data cannot be read.
     """
     splits = {split: progress(_SplitReader(dataset, split), split) for split in dataset.splits}
-    write_dataset(Path(folder), dataset.scene, splits, dataset.metadata, overwrite)
+    write_splits(Path(folder), dataset.scene, splits, dataset.metadata, overwrite)
 
 
 class _SplitReader:

@@ -8,9 +8,9 @@ from pathlib import Path
 from cconv.data.deep_lagrangian_fluids import SUFFIX, DeepLagrangianFluidsSource, holds_records
 from cconv.data.hdf5 import FILES, LagrangeBenchSource, holds_hdf5
 from cconv.data.source import SPLITS, Given, TrajectorySource
-from cconv.data.splits import Block, split_by_trajectory, split_in_time
+from cconv.data.splits import Block, checked_fractions, split_names
 from cconv.data.trajectory import Scene, Trajectory
-from cconv.errors import ConfigError, DataError, did_you_mean
+from cconv.errors import DataError, did_you_mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +116,7 @@ def open_dataset(
         ConfigError: If a setting cannot be.
     """
     folder = Path(path)
-    fractions = _checked_fractions(split_fractions, gap)
+    fractions = checked_fractions(split_fractions, gap)
     given = Given(
         mass=mass, particle_spacing=particle_spacing, frame_dt=frame_dt, force=None if force is None else tuple(force)
     )
@@ -158,36 +158,7 @@ def _splits(
         return stored
     if stored:
         # Published DeepLagrangianFluids sets have no test split: a part of the validation split becomes the test split.
-        valid, test = _split_names(source, source.stored_splits["valid"], fractions[1:], gap, seed, folder)
+        valid, test = split_names(source.stored_splits["valid"], source.num_frames, fractions[1:], gap, seed, folder)
         return {"train": stored["train"], "valid": valid, "test": test}
-    return dict(zip(SPLITS, _split_names(source, source.names, fractions, gap, seed, folder), strict=True))
-
-
-def _split_names(
-    source: TrajectorySource, names: Sequence[str], fractions: Sequence[float], gap: int, seed: int, folder: Path
-) -> list[tuple[Block, ...]]:
-    if len(names) == 1:
-        num_frames, needed = source.num_frames(names[0]), len(fractions) + gap * (len(fractions) - 1)
-        if num_frames < needed:
-            raise DataError(
-                f"{folder}: trajectory {names[0]} has {num_frames} frames, too few to cut into {len(fractions)} blocks "
-                f"with a gap of {gap}; at least {needed} are needed: add frames or lower the gap."
-            )
-        return split_in_time(names[0], num_frames, fractions, gap)
-    if len(names) < len(fractions):
-        raise DataError(
-            f"{folder}: has {len(names)} trajectories, too few for {len(fractions)} splits; "
-            "add trajectories, or open a folder with a single one to have it cut in time."
-        )
-    return split_by_trajectory(names, fractions, seed)
-
-
-def _checked_fractions(fractions: Sequence[float], gap: int) -> tuple[float, ...]:
-    fractions = tuple(float(fraction) for fraction in fractions)
-    if len(fractions) != len(SPLITS) or not all(fraction > 0 for fraction in fractions):
-        raise ConfigError(f"`split_fractions` must be three positive shares (train, valid, test), got {fractions}.")
-    if abs(sum(fractions) - 1) > 1e-6:
-        raise ConfigError(f"`split_fractions` must sum to 1, got {fractions}, which sum to {sum(fractions):g}.")
-    if gap < 0:
-        raise ConfigError(f"`gap` must be at least 0, got {gap}.")
-    return fractions
+    blocks = split_names(source.names, source.num_frames, fractions, gap, seed, folder)
+    return dict(zip(SPLITS, blocks, strict=True))

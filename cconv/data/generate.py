@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 
 from cconv import scenes, sph
 from cconv.data.folders import check_free
-from cconv.data.hdf5 import FILES, write_dataset
+from cconv.data.hdf5 import FILES, write_splits
 from cconv.data.metadata import OWN_KEY
 from cconv.data.side_by_side import available_cores, side_by_side
 from cconv.data.simulate import Simulation, simulate
@@ -94,7 +94,7 @@ def generate(
         for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
             pass
         (unfinished / _WRITING).touch()  # from now on the content of the folder is ours
-        write_dataset(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), may_replace)
+        write_splits(folder, _describe(scene), _splits(scene, files, frames), _metadata(scene, frames), may_replace)
         failures = tuple(line for file in files for line in _facts(file)["failures"])
         shutil.rmtree(unfinished)
     return Generated(count - len(calls), failures)

@@ -142,7 +142,7 @@ def holds_hdf5(folder: Path) -> bool:
     return any((folder / name).exists() for name in FILES)
 
 
-def write_dataset(
+def write_splits(
     folder: Path,
     scene: Scene,
     splits: Mapping[str, Iterable[Trajectory]],

@@ -4,16 +4,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 
 import torch
-from scipy.spatial import cKDTree
 
 from cconv.data.dataset import Dataset
-from cconv.data.plausibility import first_of_each, trajectory_findings
+from cconv.data.plausibility import MOST_NEIGHBORS, SharedFrames, first_of_each, mean_neighbors, trajectory_findings
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.neighbors import radius_graph
-
-MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
 
 
 def inspect_dataset(
@@ -37,14 +34,14 @@ def inspect_dataset(
     scene = dataset.scene
     cutoff = 2 * scene.particle_spacing if cutoff is None else cutoff
     collected: dict[ParticleType | str, list] = defaultdict(list)
-    splits, findings = {}, []
+    splits, findings, shared = {}, [], SharedFrames()
     for split, blocks in dataset.splits.items():
         splits[split] = {"trajectories": len(blocks), "frames": 0}
         for k in progress(range(len(blocks)), split):
             trajectory = dataset.trajectory(split, k)
             splits[split]["frames"] += len(trajectory)
             _collect(collected, trajectory, scene.box, cutoff)
-            findings += trajectory_findings(trajectory, scene)
+            findings += [*trajectory_findings(trajectory, scene), *shared.findings(split, trajectory)]
     return {
         "path": str(dataset.path),
         "format": dataset.format,
@@ -120,8 +117,7 @@ def _fluid_neighbors(frame: Frame, box: Box, cutoff: float) -> torch.Tensor:
 
 def _check_affordable(positions: torch.Tensor, cutoff: float) -> None:
     """Raise `ConfigError` if a cutoff, or the particle spacing that it was taken from, is far too large to count."""
-    tree = cKDTree(positions.double().numpy())
-    mean = tree.count_neighbors(tree, cutoff) / len(positions) if cutoff > 0 else 0.0
+    mean = mean_neighbors(positions, cutoff) if cutoff > 0 else 0.0
     if mean > MOST_NEIGHBORS:
         raise ConfigError(
             f"`cutoff` {cutoff:g} holds {mean:.0f} neighbours a particle, at most {MOST_NEIGHBORS} are counted; give a "

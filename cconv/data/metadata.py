@@ -137,6 +137,7 @@ def _deduced(metadata: Mapping, file: Path, dim: int, stores_velocity: bool, sto
     """What our key would hold for a LagrangeBench set, which has none: name, force and what is missing."""
     force, force_line = _external_force(metadata, file, dim)
     missing = {
+        "frame dt": None if "write_every" in metadata else "`write_every` is not stored; frames are one `dt` apart",
         "velocities": None if stores_velocity else f"not stored; {DIFFERENCES}",
         "masses": None if stores_mass else f"not stored; rest density 1 times dx^{dim}",
         "force": force_line,
@@ -206,7 +207,8 @@ def _own(own: Mapping, key: str, file: Path, fits: Callable[[object], bool], wan
 
 
 def _frame_dt(metadata: Mapping, file: Path) -> float:
-    frame_dt = _positive(metadata, "dt", file) * _positive(metadata, "write_every", file)
+    steps = _positive(metadata, "write_every", file) if "write_every" in metadata else 1.0
+    frame_dt = _positive(metadata, "dt", file) * steps
     if not SMALLEST <= frame_dt <= LARGEST:
         raise DataError(f"{file}: `dt` times `write_every` must be {SMALLEST:g} to {LARGEST:g}, got {frame_dt:g}.")
     return frame_dt

@@ -4,6 +4,7 @@ Readers refuse damaged files. This module reports what is only suspicious: each 
 frame and particle with the problem, and what to do.
 """
 
+import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,9 +16,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
+from cconv.data.quantities import density_deviation
 from cconv.data.source import STORED
 from cconv.data.splits import evenly_spaced
 from cconv.data.trajectory import ParticleType, Scene, Trajectory
+from cconv.errors import DataError
+from cconv.sph.kernels import QuinticSpline
 
 FRAMES_WITH_NEIGHBORS = 5  # in which nearest neighbours are looked for, evenly spaced over a trajectory
 SPACING_RANGE = (0.5, 1.5)  # median distance of nearest neighbours, in particle spacings
@@ -26,6 +30,14 @@ LARGEST_SPEED = 25  # in mean speeds of a trajectory
 VELOCITY_RANGE = (0.5, 2.0)  # length of steps, in lengths that velocities say
 FAR_AWAY = 20  # distance from the middle of the fluid, in distances that nine of ten particles keep
 AT_REST = 1e-4  # length of a step, in particle spacings
+USUAL_CUTOFF = 2  # of networks, in particle spacings
+MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
+MANY_NEIGHBORS = 1000  # within the usual cutoff, beyond which the spacing is wrong
+HALF = 0.5  # share of the fluid particles
+DENSITY_RANGE = (0.7, 1.4)  # number density of the fluid, in that of a lattice of the particle spacing
+LARGEST_DENSITY = 2.0  # of a particle, in that at rest
+JUMP = 4  # length of a step, in lengths that the faster of the velocities at its ends says
+FEW = 8  # particles, of which neither densities nor equal frames tell anything
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +50,7 @@ class DataFinding:
         frame: Stored number of the first frame with the problem.
         particle: Stored number of a particle with the problem; None if it concerns all.
         text: The problem and what to do.
+        stops: Whether nothing can be learned from such data, so that a study refuses them.
         others: Number of other trajectories, or blocks of one, with the problem.
     """
 
@@ -46,6 +59,7 @@ class DataFinding:
     frame: int
     particle: int | None
     text: str
+    stops: bool = False
     others: int = 0
 
     def __str__(self) -> str:
@@ -74,16 +88,56 @@ def dataset_findings(
         DataError: If the data are damaged.
     """
     blocks = [(split, k) for split in splits or dataset.splits for k in range(len(dataset.splits[split]))]
-    found = (trajectory_findings(dataset.trajectory(*block), dataset.scene) for block in progress(blocks, "check data"))
-    return first_of_each([finding for findings in found for finding in findings])
+    shared, found = SharedFrames(), []
+    for split, k in progress(blocks, "check data"):
+        trajectory = dataset.trajectory(split, k)
+        found += [*trajectory_findings(trajectory, dataset.scene), *shared.findings(split, trajectory)]
+    return first_of_each(found)
 
 
 def first_of_each(findings: Sequence[DataFinding]) -> list[DataFinding]:
-    """The first finding of each check, with the number of other trajectories that have it too."""
+    """The first finding of each check, what stops before others, with the number of other trajectories that have it."""
     counts: dict[str, list[DataFinding]] = {}
-    for finding in findings:
+    for finding in sorted(findings, key=lambda finding: not finding.stops):
         counts.setdefault(finding.check, []).append(finding)
-    return [replace(first, others=len(rest)) for first, *rest in counts.values()]
+    return [replace(first, others=len({each.trajectory for each in rest})) for first, *rest in counts.values()]
+
+
+def refuse_nonsense(findings: Iterable[DataFinding]) -> None:
+    """Refuse data from which nothing can be learned.
+
+    Raises:
+        DataError: With the first finding that stops.
+    """
+    for finding in findings:
+        if finding.stops:
+            raise DataError(f"the data make no sense: {finding}")
+
+
+class SharedFrames:
+    """Finds frames that stand in two splits, where the second only seems to be new."""
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, tuple[str, str, int]] = {}
+
+    def findings(self, split: str, trajectory: Trajectory) -> list[DataFinding]:
+        """The first frame of a trajectory that another split has too, if there is one; remembers its frames."""
+        for k, positions in enumerate(trajectory.positions):
+            content = positions.contiguous().numpy()
+            if len(content) < FEW or not content.any():
+                continue
+            here = split, trajectory.name, trajectory.first_frame + k
+            there = self._seen.setdefault(hashlib.blake2b(content, digest_size=16).digest(), here)
+            if there[0] != split:
+                text = (
+                    f"it is frame {there[2]} of trajectory {there[1]} in the {there[0]} split; splits must not share "
+                    "frames of a run: give each run to one split"
+                )
+                found = DataFinding(
+                    check="shared", trajectory=here[1], frame=here[2], particle=None, text=text, stops=True
+                )
+                return [found]
+        return []
 
 
 def trajectory_findings(trajectory: Trajectory, scene: Scene) -> list[DataFinding]:
@@ -99,6 +153,7 @@ def trajectory_findings(trajectory: Trajectory, scene: Scene) -> list[DataFindin
             frame=trajectory.first_frame + seen.frame,
             particle=None if seen.particle is None else int(fluid[seen.particle]),
             text=seen.text,
+            stops=seen.stops,
         )
         for check, look in CHECKS.items()
         if (seen := look(view)) is not None
@@ -112,6 +167,7 @@ class _Seen:
     frame: int
     particle: int | None
     text: str
+    stops: bool = False
 
 
 class _Fluid:
@@ -145,6 +201,25 @@ class _Fluid:
         frames = evenly_spaced(len(self.positions), FRAMES_WITH_NEIGHBORS) if len(self.numbers) > 1 else ()
         return {frame: self._nearest_in(frame) for frame in frames}
 
+    @cached_property
+    def densities(self) -> dict[int, Tensor]:
+        """Sums of kernels over all particles times dx^D, by frame; 1 on a lattice. Empty where they cannot be."""
+        scene, particles = self.scene, self.trajectory
+        reach = QuinticSpline(scene.particle_spacing, scene.dim).support_radius
+        wrapping = [length for length, wraps in zip(scene.box.lengths, scene.box.periodic, strict=True) if wraps]
+        if len(self.numbers) < FEW or min(wrapping, default=math.inf) < 2 * reach:
+            return {}
+        stored = particles.particle_types != ParticleType.PAD
+        found = {}
+        for frame in self.nearest:
+            if mean_neighbors(self.positions[frame], reach) > MOST_NEIGHBORS:
+                continue
+            chosen = replace(particles[frame], positions=scene.box.wrap(particles[frame].positions[stored]))
+            alike = replace(chosen, masses=torch.ones(int(stored.sum()), dtype=torch.float64))
+            is_fluid = particles.particle_types[stored] == ParticleType.FLUID
+            found[frame] = density_deviation(alike, scene)[is_fluid] + 1
+        return found
+
     def _nearest_in(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Distance of each fluid particle to the nearest other particle, fluid or wall, and that one's number, (N,)."""
         stored = (self.trajectory.particle_types != ParticleType.PAD).nonzero()[:, 0]
@@ -156,6 +231,12 @@ class _Fluid:
         numbers = stored.numpy()[numbers]
         itself = numbers[:, 1] == self.numbers.numpy()  # of particles at the same place, either may come first
         return distances[:, 1], np.where(itself, numbers[:, 0], numbers[:, 1])
+
+
+def mean_neighbors(positions: Tensor, radius: float) -> float:
+    """Mean number of particles (N, D) within a radius of one, itself included; without regard to periodic axes."""
+    tree = cKDTree(positions.double().numpy())
+    return float(tree.count_neighbors(tree, radius)) / len(positions)
 
 
 def _first(where: Tensor) -> tuple[int, int, int] | None:
@@ -187,7 +268,7 @@ def _zeros(fluid: _Fluid) -> _Seen | None:
     if len(fluid.numbers) < 2 or not zero.any():
         return None
     text = f"all positions are zero, in {int(zero.sum())} frames: they were never written; cut the trajectory before"
-    return _Seen(int(zero.int().argmax()), None, text)
+    return _Seen(int(zero.int().argmax()), None, text, stops=bool(zero[0]))
 
 
 def _frozen(fluid: _Fluid) -> _Seen | None:
@@ -287,6 +368,76 @@ def _spacing(fluid: _Fluid) -> _Seen | None:
     return None
 
 
+def _neighbors(fluid: _Fluid) -> _Seen | None:
+    """No neighbours within the usual cutoff, or a thousand: the spacing is of other units than the positions."""
+    cutoff = USUAL_CUTOFF * fluid.scene.particle_spacing
+    for frame, (distances, _) in fluid.nearest.items():
+        lonely = distances > cutoff
+        if lonely.mean() > HALF:
+            text = (
+                f"{lonely.mean():.0%} of the fluid particles have no neighbour within {cutoff:.3g}, "
+                f"{USUAL_CUTOFF} particle spacings; give --particle-spacing (about {np.median(distances):.3g})"
+            )
+            return _Seen(frame, int(lonely.argmax()), text, stops=True)
+        mean = mean_neighbors(fluid.positions[frame], cutoff)
+        if mean > MANY_NEIGHBORS:
+            text = (
+                f"fluid particles have {mean:.0f} neighbours within {cutoff:.3g}, {USUAL_CUTOFF} particle spacings; "
+                f"give --particle-spacing (about {np.median(distances):.3g})"
+            )
+            return _Seen(frame, None, text, stops=True)
+    return None
+
+
+def _number_density(fluid: _Fluid) -> _Seen | None:
+    """Particles packed otherwise than the spacing says; a free surface and thin walls lower the sums beside them."""
+    low, high = DENSITY_RANGE
+    for frame, densities in fluid.densities.items():
+        middle, inner = (float(densities.quantile(share)) for share in (0.5, 0.9))
+        if middle > high or inner < low:
+            packed = middle if middle > high else inner
+            fits = fluid.scene.particle_spacing * packed ** (-1 / fluid.scene.dim)
+            text = (
+                f"the fluid is {packed:.3g} times as dense as its particle spacing {fluid.scene.particle_spacing:g} "
+                f"says; give --particle-spacing {fits:.3g}, unless the simulation compresses it so"
+            )
+            return _Seen(frame, None, text)
+    return None
+
+
+def _compressed(fluid: _Fluid) -> _Seen | None:
+    """Particles far denser than at rest, in data whose spacing fits."""
+    if _number_density(fluid) is not None:
+        return None
+    for frame, densities in fluid.densities.items():
+        seen = _first_beyond(
+            densities[None],
+            LARGEST_DENSITY,
+            "the density there is {value} times that at rest ({count} fluid particles are beyond "
+            f"{LARGEST_DENSITY:g}); the simulation clumps or blew up: look at this frame",
+        )
+        if seen is not None:
+            return replace(seen, frame=frame)
+    return None
+
+
+def _jumps(fluid: _Fluid) -> _Seen | None:
+    """Steps beyond a spacing that stored velocities do not explain: another order of particles, or an explosion."""
+    if fluid.scene.velocity_source != STORED or len(fluid.steps) == 0:
+        return None
+    said = torch.maximum(fluid.speeds[1:], fluid.speeds[:-1]) * fluid.scene.frame_dt
+    moved = torch.linalg.vector_norm(fluid.steps, dim=-1)
+    if (moved > JUMP * said).double().mean() > HALF:
+        return None  # velocities of other units, or none, which are no jumps
+    seen = _first_beyond(
+        moved / torch.maximum(JUMP * said, torch.full_like(said, fluid.scene.particle_spacing)),
+        1.0,
+        "it jumps {value} times as far from the frame before as its velocity and the particle spacing allow ({count} "
+        "fluid particles do); sort particles by their ids, correct `bounds`, or cut the trajectory before",
+    )
+    return None if seen is None else replace(seen, frame=seen.frame + 1)
+
+
 def _duplicates(fluid: _Fluid) -> _Seen | None:
     for frame, (distances, others) in fluid.nearest.items():
         same = distances <= SAME_PLACE * min(fluid.scene.particle_spacing, float(np.median(distances)))
@@ -296,7 +447,7 @@ def _duplicates(fluid: _Fluid) -> _Seen | None:
                 f"particle {others[particle]} is at the same place ({int(same.sum())} fluid particles share theirs); "
                 "drop copies, or mind that the simulation lets particles merge"
             )
-            return _Seen(frame, particle, text)
+            return _Seen(frame, particle, text, stops=bool(same.mean() > HALF))
     return None
 
 
@@ -307,8 +458,12 @@ CHECKS: dict[str, Callable[[_Fluid], _Seen | None]] = {
     "outside": _outside,
     "far": _far,
     "crossing": _crossing,
+    "jumps": _jumps,
     "speeds": _speeds,
     "velocities": _velocities,
     "spacing": _spacing,
+    "neighbors": _neighbors,
+    "number_density": _number_density,
+    "compressed": _compressed,
     "duplicates": _duplicates,
 }

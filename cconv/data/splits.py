@@ -1,9 +1,13 @@
 """Splits by trajectory, or by consecutive blocks of time; never by random frame."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from cconv.data.source import SPLITS
+from cconv.errors import ConfigError, DataError
 
 
 class Block(NamedTuple):
@@ -42,3 +46,56 @@ def split_in_time(name: str, num_frames: int, fractions: Sequence[float], gap: i
         blocks.append((Block(name, start, start + count),))
         start += count + gap
     return blocks
+
+
+def split_names(
+    names: Sequence[str],
+    num_frames: Callable[[str], int],
+    fractions: Sequence[float],
+    gap: int,
+    seed: int,
+    folder: Path,
+) -> list[tuple[Block, ...]]:
+    """Whole trajectories where there are enough of them; a single one is cut in time.
+
+    Args:
+        names: Names of the trajectories.
+        num_frames: Number of frames of the one with a name.
+        fractions: Shares of the splits.
+        gap: Frames dropped between blocks of a single trajectory.
+        seed: Seed of the permutation of trajectories.
+        folder: Folder of the data, for messages.
+
+    Raises:
+        DataError: If there are too few trajectories, or too few frames of a single one.
+    """
+    if len(names) == 1:
+        frames, needed = num_frames(names[0]), len(fractions) + gap * (len(fractions) - 1)
+        if frames < needed:
+            raise DataError(
+                f"{folder}: trajectory {names[0]} has {frames} frames, too few to cut into {len(fractions)} blocks "
+                f"with a gap of {gap}; at least {needed} are needed: add frames or lower the gap."
+            )
+        return split_in_time(names[0], frames, fractions, gap)
+    if len(names) < len(fractions):
+        raise DataError(
+            f"{folder}: has {len(names)} trajectories, too few for {len(fractions)} splits; "
+            "add trajectories, or open a folder with a single one to have it cut in time."
+        )
+    return split_by_trajectory(names, fractions, seed)
+
+
+def checked_fractions(fractions: Sequence[float], gap: int) -> tuple[float, ...]:
+    """Shares of the three splits, as they are.
+
+    Raises:
+        ConfigError: If they are not three positive numbers that sum to 1, or the gap is negative.
+    """
+    fractions = tuple(float(fraction) for fraction in fractions)
+    if len(fractions) != len(SPLITS) or not all(fraction > 0 for fraction in fractions):
+        raise ConfigError(f"`split_fractions` must be three positive shares (train, valid, test), got {fractions}.")
+    if abs(sum(fractions) - 1) > 1e-6:
+        raise ConfigError(f"`split_fractions` must sum to 1, got {fractions}, which sum to {sum(fractions):g}.")
+    if gap < 0:
+        raise ConfigError(f"`gap` must be at least 0, got {gap}.")
+    return fractions

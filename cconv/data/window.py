@@ -234,6 +234,11 @@ def check_length(trajectory: str, frames: int, history: int, future: int) -> Non
     Raises:
         DataError: If it is too short.
     """
+    if frames == 1:
+        raise DataError(
+            f"trajectory {trajectory}: has a single frame, and a step leads to the next one; store frames at one "
+            "interval (cconv data import without --separate-frames), or ask for a field."
+        )
     if frames < history + future:
         raise DataError(
             f"trajectory {trajectory}: has {frames} frames, too few for a window of {history} and {future} after it; "

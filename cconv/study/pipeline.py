@@ -8,7 +8,7 @@ from functools import cache
 from typing import cast
 
 from cconv.data.dataset import Dataset
-from cconv.data.plausibility import dataset_findings
+from cconv.data.plausibility import dataset_findings, refuse_nonsense
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
@@ -39,6 +39,7 @@ from cconv.study.stages.session import Progress, Session
 from cconv.study.studies import recorded_space, recorded_study
 from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import WALLS
+from cconv.tasks.plausibility import target_findings
 from cconv.validation import check_setting
 
 RAY_FILES, PREDICTOR = "ray", "predictor"  # folders in that of the run
@@ -157,7 +158,9 @@ def _session(
     check_test_split(study, dataset, task)
     if may_add_force(space, study):
         force_to_add(dataset.scene)
-    problem = with_predictor(load_problem(study, dataset, task, progress), study, run.path / PREDICTOR, progress)
+    problem = load_problem(study, dataset, task, progress)
+    refuse_nonsense(target_findings(problem.typical_samples, task, stops=True))
+    problem = with_predictor(problem, study, run.path / PREDICTOR, progress)
     for name in problem.task.optional:
         if name not in problem.present_features or (name == WALLS and not dataset.scene.has_boundary):
             space = fixed(space, feature_path(name))  # nothing to search, e.g. where there are no walls
@@ -188,9 +191,14 @@ def _session(
 def _described_data(
     study: StudyConfig, run: RunFolder, observer: Observer, progress: Progress, workers: int
 ) -> Dataset:
-    """The data of a study; findings about them are told, and recorded with all else that a run depends on."""
+    """The data of a study; findings about them are told, and recorded with all else that a run depends on.
+
+    Raises:
+        DataError: If the data make no sense.
+    """
     dataset = open_study_data(study.data, study.seeds.data)
     findings = dataset_findings(dataset, progress)
+    refuse_nonsense(findings)
     observer.on_data([str(finding) for finding in findings])
     described = describe_environment(study, dataset, workers)
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})

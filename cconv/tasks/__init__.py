@@ -6,9 +6,14 @@ from cconv.errors import check_choice
 from cconv.tasks.acceleration import Acceleration
 from cconv.tasks.density_gradient import DensityGradient
 from cconv.tasks.density_rate import DensityRate
-from cconv.tasks.task import Task, as_step
+from cconv.tasks.task import FieldTask, Task, as_step
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (DensityRate, DensityGradient, Acceleration)}
+
+
+def field_tasks() -> list[FieldTask]:
+    """Make the tasks that ask for a field, with their usual kernels."""
+    return [task() for task in TASKS.values() if issubclass(task, FieldTask)]
 
 
 def task_named(

@@ -10,7 +10,7 @@ from contracts.registered import registered
 
 from cconv.data.dataset import open_dataset
 from cconv.data.generate import generate
-from cconv.data.hdf5 import write_dataset
+from cconv.data.hdf5 import write_splits
 from cconv.data.window import Windows
 from cconv.domain import Box
 from cconv.evaluation.rollout_metrics import squared_errors
@@ -131,7 +131,7 @@ def test_the_scene_of_a_data_set_is_found(scene, dataset):
 @pytest.mark.integration
 def test_what_a_data_set_says_survives_another_writing(dataset, tmp_path):
     splits = {split: list(dataset.trajectories(split)) for split in dataset.splits}
-    write_dataset(tmp_path / "again", dataset.scene, splits, dataset.metadata)
+    write_splits(tmp_path / "again", dataset.scene, splits, dataset.metadata)
     again = open_dataset(tmp_path / "again")
     assert again.scene == dataset.scene
     assert again.metadata == dataset.metadata

@@ -10,7 +10,7 @@ from systems import periodic_scene, periodic_trajectory
 from cconv.data import stored_frames
 from cconv.data.dataset import open_dataset
 from cconv.data.growing import growing_dataset
-from cconv.data.hdf5 import write_dataset
+from cconv.data.hdf5 import write_splits
 from cconv.data.metadata import DIFFERENCES
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import Trajectory
@@ -55,7 +55,7 @@ def assert_same_data(folder, other):
 def test_what_grew_is_what_is_written_at_once(piece, path, tmp_path, monkeypatch):
     monkeypatch.setattr("cconv.data.growing.FRAMES_OF_A_PIECE", piece)
     grow(tmp_path / "grown", path, path.positions[3:])
-    write_dataset(tmp_path / "whole", SCENE, {split: [path] for split in SPLITS}, {"solver": "SPH"})
+    write_splits(tmp_path / "whole", SCENE, {split: [path] for split in SPLITS}, {"solver": "SPH"})
     assert_same_data(tmp_path / "grown", tmp_path / "whole")
 
 
@@ -67,7 +67,7 @@ def test_what_ends_the_block_keeps_the_frames_so_far(kind, path, tmp_path):
 
     with pytest.raises(kind):
         grow(tmp_path / "grown", path, frames())
-    write_dataset(tmp_path / "whole", SCENE, {split: [part(path, 5)] for split in SPLITS}, {"solver": "SPH"})
+    write_splits(tmp_path / "whole", SCENE, {split: [part(path, 5)] for split in SPLITS}, {"solver": "SPH"})
     assert_same_data(tmp_path / "grown", tmp_path / "whole")
     assert {each.name for each in tmp_path.iterdir()} == {"grown", "whole"}
 
@@ -95,7 +95,7 @@ def test_a_folder_that_holds_something_is_refused(path, tmp_path):
 @pytest.mark.parametrize("piece", [1, 2, 64])
 def test_frames_that_are_read_in_pieces_are_those_of_the_trajectory(piece, path, tmp_path, monkeypatch):
     monkeypatch.setattr(stored_frames, "FRAMES_OF_A_PIECE", piece)
-    write_dataset(tmp_path, SCENE, {split: [path] for split in SPLITS})
+    write_splits(tmp_path, SCENE, {split: [path] for split in SPLITS})
     dataset = open_dataset(tmp_path)
     whole, frames = dataset.trajectory("test", 0), StoredFrames(dataset, "test", 0)
     assert (len(frames), frames.name, frames.first_frame) == (len(whole), whole.name, 0)

@@ -9,7 +9,7 @@ from particle_files import METADATA, record_frames, write_hdf5, write_parts
 
 from cconv.data.convert import convert
 from cconv.data.dataset import open_dataset
-from cconv.data.hdf5 import write_dataset
+from cconv.data.hdf5 import write_splits
 from cconv.data.trajectory import finite_difference_velocities
 from cconv.errors import ConfigError, DataError
 from cconv.forces import ConstantForce, ReversePoiseuilleForce
@@ -107,7 +107,7 @@ def test_a_force_is_known_by_its_case_and_code_beside_the_data_not_run(tmp_path,
 def test_a_force_is_declared_by_name_and_read_again(tmp_path, force):
     write_hdf5(tmp_path / "a")
     dataset = open_dataset(tmp_path / "a")
-    write_dataset(
+    write_splits(
         tmp_path / "b",
         replace(dataset.scene, force=force),
         {split: dataset.trajectories(split) for split in dataset.splits},
@@ -261,7 +261,15 @@ def nan_from(frame):
     return positions
 
 
-@pytest.mark.parametrize("key", ["dim", "dx", "dt", "write_every", "bounds", "periodic_boundary_conditions"])
+def test_frames_are_one_time_step_apart_where_nothing_says_how_many(tmp_path):
+    write_hdf5(tmp_path)
+    (tmp_path / "metadata.json").write_text(json.dumps({k: v for k, v in METADATA.items() if k != "write_every"}))
+    scene = open_dataset(tmp_path).scene
+    assert scene.frame_dt == METADATA["dt"]
+    assert any(line.startswith("frame dt: `write_every` is not stored") for line in scene.missing)
+
+
+@pytest.mark.parametrize("key", ["dim", "dx", "dt", "bounds", "periodic_boundary_conditions"])
 def test_missing_metadata_key_is_named(tmp_path, key):
     write_hdf5(tmp_path)
     (tmp_path / "metadata.json").write_text(json.dumps({k: v for k, v in METADATA.items() if k != key}))
@@ -296,7 +304,7 @@ def test_failed_writing_leaves_nothing(tmp_path):
     with pytest.raises(DataError):
         convert(dataset, tmp_path / "b")
     with pytest.raises(DataError, match="'valid' has no trajectory"):
-        write_dataset(tmp_path / "c", dataset.scene, {"train": [dataset.trajectory("test", 0)]})
+        write_splits(tmp_path / "c", dataset.scene, {"train": [dataset.trajectory("test", 0)]})
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a"]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -9,11 +10,13 @@ import torch
 from particle_files import write_hdf5
 
 from cconv.data.dataset import open_dataset
-from cconv.data.plausibility import CHECKS, dataset_findings, trajectory_findings
+from cconv.data.plausibility import CHECKS, dataset_findings, refuse_nonsense, trajectory_findings
 from cconv.data.trajectory import ParticleType, Scene, Trajectory
 from cconv.domain import Box
+from cconv.errors import DataError
 
 SPACING, FRAME_DT, FRAMES = 0.1, 0.02, 6
+OTHER_CASES = {"spacing", "neighbors", "number_density"}  # which have tests of their own
 
 
 def lattice(periodic=False, shift=0.0):
@@ -86,6 +89,15 @@ def other_units(trajectory):
     trajectory.velocities.mul_(FRAME_DT)
 
 
+def clumped(trajectory):
+    rows = trajectory.positions[0].reshape(8, 8, 2)
+    rows[2:5, 2:5] += 0.8 * (rows[3, 3] - rows[2:5, 2:5])
+
+
+def in_another_order(trajectory):
+    trajectory.positions[3:] = trajectory.positions[3:].roll(9, dims=1)
+
+
 def no_velocities(trajectory):
     trajectory.velocities.zero_()
 
@@ -101,6 +113,8 @@ def no_velocities(trajectory):
         ("far", lost, 13, 5, "times as far from the middle"),
         ("crossing", crossing, 13, 5, "moves 1.1 along y.*not periodic.*periodic_boundary_conditions"),
         ("speeds", exploded, 13, 5, "times the mean"),
+        ("compressed", clumped, 10, 18, "the density there is [0-9.]+ times that at rest .9 fluid"),
+        ("jumps", in_another_order, 13, 0, "jumps [0-9.]+ times as far.*sort particles by their ids"),
         ("duplicates", same_place, 10, 5, "particle 6 is at the same place .2 fluid"),
         ("velocities", other_units, 10, None, "50 times as far.*--frame-dt"),
         ("velocities", no_velocities, 10, None, "inf times as far"),
@@ -129,6 +143,59 @@ def test_a_spacing_that_does_not_fit_the_particles_is_named(factor):
     trajectory, scene = lattice()
     found = trajectory_findings(trajectory, replace(scene, particle_spacing=factor * SPACING))
     assert "spacing" in [finding.check for finding in found]
+
+
+@pytest.mark.parametrize(("factor", "packed"), [(0.8, "0.64"), (1.3, "1.6[0-9]")])
+def test_a_spacing_that_does_not_fit_the_number_of_particles_is_named(factor, packed):
+    trajectory, scene = lattice(periodic=True)
+    everywhere = torch.cartesian_prod(*[SPACING * torch.arange(20, dtype=torch.float64)] * 2).expand(2, -1, -1)
+    full = replace(
+        trajectory,
+        positions=everywhere.clone(),
+        velocities=torch.zeros_like(everywhere),
+        masses=torch.full((400,), SPACING**2, dtype=torch.float64),
+        particle_types=torch.zeros(400, dtype=torch.int64),
+    )
+    found = {each.check: each for each in trajectory_findings(full, replace(scene, particle_spacing=factor * SPACING))}
+    assert re.search(f"the fluid is {packed}[0-9]* times as dense", str(found["number_density"]))
+    assert f"give --particle-spacing {SPACING:.3g}" in str(found["number_density"])
+    assert trajectory_findings(full, scene) == []
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.1, "have no neighbour within"), (60, "have 1600 neighbours within")])
+def test_no_neighbours_and_a_thousand_stop(factor, words):
+    ticks = SPACING * torch.arange(40, dtype=torch.float64)
+    positions = torch.cartesian_prod(ticks, ticks)[None]
+    trajectory, scene = lattice()
+    wide = replace(
+        trajectory,
+        positions=positions,
+        velocities=torch.zeros_like(positions),
+        masses=torch.ones(1600, dtype=torch.float64),
+        particle_types=torch.zeros(1600, dtype=torch.int64),
+    )
+    found = trajectory_findings(wide, replace(scene, particle_spacing=factor * SPACING))
+    (neighbors,) = [finding for finding in found if finding.check == "neighbors"]
+    assert words in str(neighbors)
+    assert neighbors.stops
+    with pytest.raises(DataError, match="the data make no sense: trajectory train/00000, frame 10"):
+        refuse_nonsense(found)
+
+
+def test_what_is_only_suspicious_is_not_refused():
+    trajectory, scene = lattice()
+    same_place(trajectory)
+    found = trajectory_findings(trajectory, scene)
+    assert found
+    refuse_nonsense(found)
+
+
+def test_frames_that_two_splits_share_stop(tmp_path):
+    write_hdf5(tmp_path, types=[0] * 9)
+    shutil.copy(tmp_path / "train.h5", tmp_path / "test.h5")
+    (found,) = [each for each in dataset_findings(open_dataset(tmp_path)) if each.check == "shared"]
+    assert str(found).startswith("trajectory test/00000, frame 0: it is frame 0 of trajectory train/00000 in the train")
+    assert found.stops
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.9])
@@ -176,4 +243,4 @@ def test_a_finding_that_many_trajectories_have_is_one_line(tmp_path):
 
 def test_every_check_has_a_case():
     marks = test_what_makes_no_sense_is_named_with_frame_and_particle.pytestmark
-    assert {case[0] for mark in marks for case in mark.args[1]} | {"spacing"} == set(CHECKS)
+    assert {case[0] for mark in marks for case in mark.args[1]} | OTHER_CASES == set(CHECKS)

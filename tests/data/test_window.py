@@ -46,6 +46,11 @@ def test_a_trajectory_that_is_too_short_is_refused_before_the_first_window(gener
         Windows([periodic_trajectory(generator, num_frames=4)], 6, 1)
 
 
+def test_a_single_frame_holds_no_step(generator):
+    with pytest.raises(DataError, match="a single frame, and a step leads to the next one.*--separate-frames"):
+        Windows([periodic_trajectory(generator, num_frames=1)], 6, 1)
+
+
 def walled_windows(generator):
     """Windows of different trajectories, whose numbers of particles and wall points differ."""
     found = []
