@@ -88,11 +88,11 @@ def _read_inputs(path: Path) -> _Inputs:
 def answers_table(runs: Sequence[ComparedRun]) -> pd.DataFrame:
     """One row a study: the smallest sufficient model, what it is made of, its error on the test split and its cost.
 
-    Columns: study, scene, task; model, in_words, what its network is; parameters; history, cutoff (particle spacings), layers, width (scalars and
-    vectors of a hidden layer), terms, inputs; error with ci95_low and ci95_high, of_mean, its ratio to the error of
-    predicting the mean; ms_per_frame; solver, the time of the solver's frame as a multiple; stable; dispensable, the
-    inputs whose absence raised the validation error of the best model by less than a tenth. What does not apply is
-    empty.
+    Columns: study, scene, task; model and in_words, what its network is; parameters; history, cutoff (particle
+    spacings), layers, width (scalars and vectors of a hidden layer), terms, inputs; error with ci95_low and ci95_high,
+    of_mean, its ratio to the error of predicting the mean; ms_per_frame; solver, the time of the solver's frame as a
+    multiple; stable; dispensable, the inputs whose absence raised the validation error of the best model by less than a
+    tenth. What does not apply is empty.
     """
     return pd.DataFrame([_answer(run) for run in runs])
 
