@@ -3,13 +3,12 @@
 Source: Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020), section 4.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
@@ -29,24 +28,19 @@ from cconv.networks.network import (
     Channels,
     ConvolutionNetwork,
     ConvolutionSettings,
-    Layers,
     LinearTerms,
     WallInputs,
     assign_rows,
     check_single_layer,
     with_inputs,
 )
+from cconv.nn.activations import ACTIVATIONS
 from cconv.nn.continuous_conv import MESSAGES, ContinuousConv, ConvGeometry
 from cconv.nn.kinds import Kinds, split_kinds
+from cconv.nn.layers import Layers
 from cconv.ops.convolution import columns
 from cconv.validation import Flag, Whole
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": F.relu,
-    "gelu": F.gelu,
-    "tanh": torch.tanh,
-    "leaky_relu": F.leaky_relu,
-}
 SKIPS = ("before_activation", "after_activation", "none")
 
 

@@ -47,6 +47,7 @@ class Task(ABC):
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[str, ...]]  # which models may do without
+    on_request: ClassVar[tuple[str, ...]] = ()  # those of them that models have only where a study names them
     checks: ClassVar[tuple[str, ...]]  # of stability, that models must pass: names in `cconv.evaluation.checks`
     histories: ClassVar[tuple[int, int]] = (1, 1)  # the shortest and the longest
 

@@ -46,8 +46,9 @@ class TaskConfig(StrictModel):
     """What is asked of a network: the task, its SPH kernel, and the features that networks are given.
 
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
-    takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
-    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
+    takes all features of the task but those that are on request. A step task also has `history`, the frames that an
+    answer depends on, and `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as
+    LagrangeBench.
     `external_force` says whether the network learns it, or the integrator adds it and the network learns the rest.
     """
 
@@ -90,8 +91,9 @@ class TaskConfig(StrictModel):
     @property
     def taken(self) -> tuple[str, ...]:
         """Features that networks are given."""
-        known = TASKS[self.name].features
-        return known if self.features is None else tuple(name for name in known if name in (CONSTANT, *self.features))
+        task = TASKS[self.name]
+        wanted = {*task.features} - {*task.on_request} if self.features is None else {CONSTANT, *self.features}
+        return tuple(name for name in task.features if name in wanted)
 
     @property
     def usual_history(self) -> int:
