@@ -22,6 +22,7 @@ from cconv.networks.network import (
     NetworkSettings,
     WallInputs,
     refuse_linear_terms,
+    varying,
     with_inputs,
 )
 from cconv.nn.activations import ACTIVATIONS
@@ -136,7 +137,7 @@ class GNSSettings(NetworkSettings):
     ) -> GNS:
         """The network with fresh weights; arguments as of `NetworkSettings.build`."""
         return GNS(
-            Channels(_varying(inputs), (outputs,), walls=walls),
+            Channels(varying(inputs), (outputs,), walls=walls),
             dim,
             layers=self.layers,
             widths=(self.hidden_channels,) * (self.mlp_layers + 1),
@@ -162,7 +163,7 @@ class GNSSettings(NetworkSettings):
     ) -> CountedCost:
         """Cost of one particle's prediction: linear maps of particles and pairs, geometry, neighbour search."""
         fluid, boundary = around.pairs(self.relative_cutoff, dim)
-        pairs, (scalars, vectors), width = fluid.neighbors + 1, _varying(inputs), self.hidden_channels
+        pairs, (scalars, vectors), width = fluid.neighbors + 1, varying(inputs), self.hidden_channels
         known = self.embedding * bool(scalars) + vectors * dim
         latent = _map(width, width)
         counted = [
@@ -185,11 +186,6 @@ class GNSSettings(NetworkSettings):
         width = self.hidden_channels
         last = _map(width, width if outputs is None else outputs)
         return entry + _map(width, width) * (self.mlp_layers - 1) + last
-
-
-def _varying(inputs: Kinds) -> Kinds:
-    """Return the inputs without the constant."""
-    return Kinds(inputs.scalars - 1, inputs.vectors)
 
 
 def _map(inputs: int, outputs: int) -> CountedCost:

@@ -27,9 +27,10 @@ from cconv.nn.kinds import Kinds
 from cconv.nn.layers import Layers
 from cconv.nn.message_passing import PairGeometry
 from cconv.nn.radial_conv import RadialGeometry
+from cconv.nn.steerable import SteerableGeometry
 from cconv.validation import Flag, Real, StrictModel, Whole
 
-Geometry = ConvGeometry | RadialGeometry | PairGeometry
+Geometry = ConvGeometry | RadialGeometry | PairGeometry | SteerableGeometry
 GeometryT = TypeVar("GeometryT", bound=Geometry)
 Layer = TypeVar("Layer", bound=nn.Module)
 Width = TypeVar("Width", int, Kinds)
@@ -94,6 +95,11 @@ class LinearTerms(ABC, Generic[GeometryT]):
     @abstractmethod
     def assign(self, coefficients: Sequence[Float[Tensor, "P C"]]) -> None:
         """Make coefficients (P, C) of each set those of the network."""
+
+
+def varying(inputs: Kinds) -> Kinds:
+    """Return the inputs without the constant, the first scalar, for networks with biases in its place."""
+    return Kinds(inputs.scalars - 1, inputs.vectors)
 
 
 def refuse_linear_terms(architecture: str) -> NoReturn:

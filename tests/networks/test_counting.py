@@ -31,6 +31,8 @@ RADIAL = [
 GRAPHS = [
     configured(architecture="gns", layers=2, hidden_channels=6, embedding=5),
     configured(architecture="gns", layers=1, hidden_channels=7, mlp_layers=3, walls=False),
+    configured(architecture="segnn", layers=2, hidden_channels=5),
+    configured(architecture="segnn", layers=1, hidden_channels=4, readout_layers=2, walls=False),
 ]
 
 
