@@ -52,6 +52,11 @@ class Edges:
         return len(self.row_splits) - 1
 
     @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.row_splits.diff() - int(self.includes_self)
+
+    @property
     def dim(self) -> int:
         """Number of space dimensions D."""
         return self.displacements.shape[1]

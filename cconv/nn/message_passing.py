@@ -47,6 +47,11 @@ class PairGeometry:
         return PairGeometry(join_edges([self.edges, *(other.edges for other in others)]))
 
     @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.edges.neighbor_counts
+
+    @property
     def nbytes(self) -> int:
         """Memory in bytes."""
         edges = self.edges

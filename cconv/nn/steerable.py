@@ -117,6 +117,11 @@ class SteerableGeometry:
         return SteerableGeometry(join_edges([self.edges, *(other.edges for other in others)]), self.harmonics)
 
     @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.edges.neighbor_counts
+
+    @property
     def nbytes(self) -> int:
         """Memory in bytes."""
         edges = self.edges

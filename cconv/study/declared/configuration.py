@@ -39,7 +39,8 @@ HYPERPARAMETERS = (
 Settings = TypeVar("Settings", bound=StrictModel)
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 Noise = Annotated[Real, Field(ge=0, le=1)]  # standard deviation of the last velocity's, particle spacings per frame
-Loss = Literal["mse", "balanced_mse"]
+SquaredLoss = Literal["mse", "balanced_mse"]
+Loss = Literal["mse", "balanced_mse", "neighbor_weighted"]
 
 
 class TaskConfig(StrictModel):
@@ -104,12 +105,13 @@ class TaskConfig(StrictModel):
 class TrainingConfig(StrictModel):
     """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
 
-    `loss` says how much each frame counts. `noise`, for step tasks, is the standard deviation of the random walk that
-    is added to the velocities of a window, in particle spacings per frame. `pushforward` is the largest number of steps
-    that the model's own rollout goes on before the step that it learns from, once a share `pushforward_from` of the
-    updates is done. `unroll` is the number of steps of that rollout that it then learns from at once, with gradients
-    through all of them, once a share `unroll_from` of the updates is done. `average` is the decay of a moving average
-    of the weights, which is evaluated and kept in their place; 0 keeps the weights themselves.
+    `loss` says how much each frame counts, or with "neighbor_weighted" each particle. `noise`, for step tasks, is the
+    standard deviation of the random walk that is added to the velocities of a window, in particle spacings per frame.
+    `pushforward` is the largest number of steps that the model's own rollout goes on before the step that it learns
+    from, once a share `pushforward_from` of the updates is done. `unroll` is the number of steps of that rollout that
+    it then learns from at once, with gradients through all of them, once a share `unroll_from` of the updates is done.
+    `average` is the decay of a moving average of the weights, which is evaluated and kept in their place; 0 keeps the
+    weights themselves.
     """
 
     updates: Updates = 600
