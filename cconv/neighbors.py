@@ -64,6 +64,21 @@ class Edges:
     def __len__(self) -> int:
         return len(self.receivers)
 
+    def apart(self) -> "Edges":
+        """Pairs of points that are not at exactly the same place."""
+        kept = self.distances > 0
+        if kept.all():
+            return self
+        ends = torch.cat([kept.new_zeros(1, dtype=torch.int64), kept.cumsum(0)])
+        return replace(
+            self,
+            receivers=self.receivers[kept],
+            senders=self.senders[kept],
+            displacements=self.displacements[kept],
+            distances=self.distances[kept],
+            row_splits=ends[self.row_splits],
+        )
+
     def check(self) -> None:
         """Require pairs that compiled loops can follow.
 

@@ -9,6 +9,7 @@ import typer
 
 from cconv.cli.console import INTERRUPTED, errors, results
 from cconv.cli.data import app as data_app
+from cconv.cli.imports import import_weights
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.rollout import rollout
 from cconv.cli.study import app as study_app
@@ -25,6 +26,7 @@ app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
 for command in (train, fit, evaluate, rollout, report):
     app.command()(command)
+app.command("import")(import_weights)
 
 
 def _print_version(wanted: bool) -> None:

@@ -204,6 +204,8 @@ class ConvNetSettings(ConvolutionSettings):
     The defaults have the published layer sizes and filters: 692,902 parameters for 4 inputs and 3 outputs in a scene
     with normals. `relative_cutoff` is the filter radius R (published: diameter 0.225 = 1.5·6·0.025 at spacing 0.05, so
     R = 2.25 spacings). Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
+    Points at exactly the same place are neighbours of each other; with `coincident = "ignored"` they are not, as in the
+    published code.
     """
 
     basis_size = "kernel_size"
@@ -219,6 +221,7 @@ class ConvNetSettings(ConvolutionSettings):
     align_corners: Flag = True
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
+    coincident: Literal["neighbors", "ignored"] = "neighbors"
 
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
@@ -250,7 +253,7 @@ class ConvNetSettings(ConvolutionSettings):
     def geometry(self, edges: Edges) -> ConvGeometry:
         """Cells and weights of the filters that each pair reads."""
         return ConvGeometry(
-            edges,
+            edges if self.coincident == "neighbors" else edges.apart(),
             self.kernel_size,
             mapping=self.mapping,
             window=self.window,
