@@ -91,9 +91,7 @@ class GNS(Network[PairGeometry]):
             particles = particles + segment_sums(messages, seen.geometry.edges.row_splits)
         pairs = self.pair_encoder(geometry.features)
         for step in self.steps:
-            particles, messages = step(particles, pairs, geometry.edges)
-            if step is not self.steps[-1]:
-                pairs = pairs + messages
+            particles, pairs = step(particles, pairs, geometry.edges)
         return self.decoder(particles)
 
     def _known(self, features: Tensor) -> Tensor:

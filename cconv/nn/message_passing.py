@@ -21,6 +21,8 @@ from torch import Tensor, nn
 from cconv.neighbors import Edges, join_edges
 from cconv.nn.activations import ACTIVATIONS
 from cconv.nn.layers import Layers
+from cconv.ops import messages
+from cconv.ops.messages import PairLayers
 
 
 class PairGeometry:
@@ -103,7 +105,10 @@ class MLP(nn.Module):
         self.norm = nn.LayerNorm(outputs) if norm else None
 
     def forward(
-        self, first: Float[Tensor, "M C"], *gathered: tuple[Float[Tensor, "P B"], Int[Tensor, " M"] | None]
+        self,
+        first: Float[Tensor, "M C"],
+        *gathered: tuple[Float[Tensor, "P B"], Int[Tensor, " M"] | None],
+        onto: Float[Tensor, "M C_out"] | None = None,
     ) -> Float[Tensor, "M C_out"]:
         """Outputs (M, C_out) of the parts of the input.
 
@@ -111,16 +116,30 @@ class MLP(nn.Module):
             first: First part (M, C).
             gathered: Further parts: values (P, B), and the row of the values that each row of the input takes (M,);
                 None where they are its rows themselves.
+            onto: What the outputs are added to; None for nothing.
         """
-        entry, *rest = self.layers
-        weights = entry.weight.split(self.parts, dim=1)
-        values = F.linear(first, weights[0], entry.bias)
-        for weight, (part, rows) in zip(weights[1:], gathered, strict=True):
-            product = F.linear(part, weight)
-            values = values + (product if rows is None else product[rows])
-        for layer in rest:
-            values = layer(self.activation(values))
-        return values if self.norm is None else self.norm(values)
+        own, *weights = self.layers[0].weight.split(self.parts, dim=1)
+        products = [
+            (None if rows is None else F.linear(part, weight), part, weight, rows)
+            for weight, (part, rows) in zip(weights, gathered, strict=True)
+        ]
+
+        def some(begin: int, end: int) -> Tensor:
+            values = F.linear(first[begin:end], own, self.layers[0].bias)
+            for product, part, weight, rows in products:
+                if product is None or rows is None:
+                    values = values + F.linear(part[begin:end], weight)
+                else:
+                    values = values + product[rows[begin:end]]
+            for layer in self.layers[1:]:
+                values = layer(self.activation(values))
+            values = values if self.norm is None else self.norm(values)
+            return values if onto is None else onto[begin:end] + values
+
+        if messages.applies(first, *(part for part, _ in gathered), *self.parameters()):
+            output = first.new_empty(len(first), self.layers[-1].out_features)
+            return messages.by_rows(some, output, sum(layer.weight.numel() for layer in self.layers))
+        return some(0, len(first))
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None = None) -> nn.Linear:
@@ -152,7 +171,35 @@ class MessagePassing(nn.Module):
     def forward(
         self, particles: Float[Tensor, "N H"], pairs: Float[Tensor, "E H"], edges: Edges
     ) -> tuple[Float[Tensor, "N H"], Float[Tensor, "E H"]]:
-        """Latent values of the particles (N, H), and what is added to those of the pairs (E, H)."""
-        messages = self.of_pairs(pairs, (particles, edges.senders), (particles, edges.receivers))
-        sums = segment_sums(messages, edges.row_splits)
-        return particles + self.of_particles(particles, (sums, None)), messages
+        """Latent values of particles (N, H) and pairs (E, H) after the step.
+
+        Where nothing is to be differentiated, those of the pairs are changed in place.
+        """
+        if messages.applies(particles, pairs, *self.parameters()):
+            sums = self._sums_in_place(particles, pairs, edges)
+        else:
+            added = self.of_pairs(pairs, (particles, edges.senders), (particles, edges.receivers))
+            sums, pairs = segment_sums(added, edges.row_splits), pairs + added
+        return self.of_particles(particles, (sums, None), onto=particles), pairs
+
+    def _sums_in_place(self, particles: Tensor, pairs: Tensor, edges: Edges) -> Tensor:
+        """Sums of the messages to each particle, which are added to the pairs."""
+        (entry, *rest), norm = self.of_pairs.layers, self.of_pairs.norm
+        assert norm is not None
+        own, of_senders, of_receivers = entry.weight.split(self.of_pairs.parts, dim=1)
+        layers = PairLayers(
+            first=own,
+            following=[(layer.weight, layer.bias) for layer in rest],
+            activation=self.of_pairs.activation,
+            scale=norm.weight,
+            offset=norm.bias,
+            smallest=norm.eps,
+        )
+        products = _products(particles, of_senders, None), _products(particles, of_receivers, entry.bias)
+        return messages.pass_messages(pairs, *products, edges.senders, edges.row_splits, layers)
+
+
+def _products(values: Tensor, weights: Tensor, bias: Tensor | None) -> Tensor:
+    """A linear map of rows, which is not differentiated."""
+    output = values.new_empty(len(values), len(weights))
+    return messages.by_rows(lambda begin, end: F.linear(values[begin:end], weights, bias), output, weights.numel())
