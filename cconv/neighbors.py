@@ -52,12 +52,32 @@ class Edges:
         return len(self.row_splits) - 1
 
     @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.row_splits.diff() - int(self.includes_self)
+
+    @property
     def dim(self) -> int:
         """Number of space dimensions D."""
         return self.displacements.shape[1]
 
     def __len__(self) -> int:
         return len(self.receivers)
+
+    def apart(self) -> "Edges":
+        """Pairs of points that are not at exactly the same place."""
+        kept = self.distances > 0
+        if kept.all():
+            return self
+        ends = torch.cat([kept.new_zeros(1, dtype=torch.int64), kept.cumsum(0)])
+        return replace(
+            self,
+            receivers=self.receivers[kept],
+            senders=self.senders[kept],
+            displacements=self.displacements[kept],
+            distances=self.distances[kept],
+            row_splits=ends[self.row_splits],
+        )
 
     def check(self) -> None:
         """Require pairs that compiled loops can follow.

@@ -128,3 +128,13 @@ def test_the_decay_of_vortices_is_checked_with_the_solver_that_makes_data_and_wi
     pressures = {name: solver._scheme.transport_pressure for name, solver in solvers.items()}
     assert pressures["as data are made"] == scene.solver()._scheme.transport_pressure == 0
     assert pressures["transport velocity"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
+def test_the_benchmark_of_gns_times_network_and_geometry(tmp_path):
+    run("gns", "--turns", "3", "--out", tmp_path / "gns.json")
+    found = json.loads((tmp_path / "gns.json").read_text())
+    assert found["particles"] == 64
+    for part in ("network_ms", "geometry_ms"):
+        assert 0 < found[part]["low"] <= found[part]["median"] <= found[part]["high"]

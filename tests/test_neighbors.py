@@ -405,3 +405,28 @@ def test_queries_and_their_batch_index_come_together(generator):
         radius_graph(points, 0.2, queries=points, batch_index=index_of([4]))
     with pytest.raises(ShapeError, match="must come with `positions`"):
         radius_graph(points, 0.2, queries=points, query_batch_index=index_of([4]))
+
+
+def test_pairs_at_the_same_place_can_be_left_out(generator):
+    points = torch.rand(60, 2, generator=generator)
+    points[:5] = points[5:10]
+    edges = radius_graph(points, 0.2)
+    apart = edges.apart()
+    apart.check()
+    assert (edges.distances == 0).sum() == len(edges) - len(apart) == 10
+    kept = [pair for pair, distance in zip(pairs_of(edges), edges.distances, strict=True) if distance > 0]
+    assert pairs_of(apart) == kept
+    expected = torch.bincount(apart.receivers, minlength=60)
+    assert torch.equal(apart.row_splits.diff(), expected)
+    assert torch.equal(apart.neighbor_counts, expected)
+    assert apart.apart() is apart
+
+
+def test_a_particle_is_not_counted_among_its_neighbors(generator):
+    points = torch.rand(60, 2, generator=generator)
+    counts = [radius_graph(points, 0.2, include_self=among).neighbor_counts for among in (False, True)]
+    assert torch.equal(*counts)
+
+
+def pairs_of(edges):
+    return list(zip(edges.receivers.tolist(), edges.senders.tolist(), strict=True))

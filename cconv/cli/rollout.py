@@ -31,7 +31,8 @@ def rollout(
         Path,
         typer.Argument(
             metavar="CHECKPOINT",
-            help="Checkpoint folder of a model of the task acceleration, or a run folder: its recommended model.",
+            help="Checkpoint folder of a model of a step (task acceleration or position_correction), or a run folder: "
+            "its recommended model.",
         ),
     ],
     data: DataPath = None,

@@ -221,7 +221,16 @@ class Model(nn.Module):
         self._check(inputs)
         cutoff = self.settings.relative_cutoff
         points, index = inputs.positions, inputs.batch_index
-        searches = [partial(radius_graph, points, cutoff, inputs.box, batch_index=index)]
+        searches = [
+            partial(
+                radius_graph,
+                points,
+                cutoff,
+                inputs.box,
+                include_self=self.settings.includes_self,
+                batch_index=index,
+            )
+        ]
         if self.config.walls and inputs.wall_positions is not None:
             searches.append(
                 partial(

@@ -3,13 +3,12 @@
 Source: Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolutions" (ICLR 2020), section 4.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
@@ -29,24 +28,19 @@ from cconv.networks.network import (
     Channels,
     ConvolutionNetwork,
     ConvolutionSettings,
-    Layers,
     LinearTerms,
     WallInputs,
     assign_rows,
     check_single_layer,
     with_inputs,
 )
+from cconv.nn.activations import ACTIVATIONS
 from cconv.nn.continuous_conv import MESSAGES, ContinuousConv, ConvGeometry
 from cconv.nn.kinds import Kinds, split_kinds
+from cconv.nn.layers import Layers
 from cconv.ops.convolution import columns
 from cconv.validation import Flag, Whole
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": F.relu,
-    "gelu": F.gelu,
-    "tanh": torch.tanh,
-    "leaky_relu": F.leaky_relu,
-}
 SKIPS = ("before_activation", "after_activation", "none")
 
 
@@ -210,6 +204,8 @@ class ConvNetSettings(ConvolutionSettings):
     The defaults have the published layer sizes and filters: 692,902 parameters for 4 inputs and 3 outputs in a scene
     with normals. `relative_cutoff` is the filter radius R (published: diameter 0.225 = 1.5·6·0.025 at spacing 0.05, so
     R = 2.25 spacings). Initial weights are the thesis's, Xavier-uniform; "open3d" draws them as the published code did.
+    Points at exactly the same place are neighbours of each other; with `coincident = "ignored"` they are not, as in the
+    published code.
     """
 
     basis_size = "kernel_size"
@@ -225,6 +221,7 @@ class ConvNetSettings(ConvolutionSettings):
     align_corners: Flag = True
     skip: Literal["before_activation", "after_activation", "none"] = "before_activation"
     initialization: Literal["xavier_uniform", "open3d", "thesis"] = "xavier_uniform"
+    coincident: Literal["neighbors", "ignored"] = "neighbors"
 
     @property
     def in_words(self) -> str:
@@ -262,7 +259,7 @@ class ConvNetSettings(ConvolutionSettings):
     def geometry(self, edges: Edges) -> ConvGeometry:
         """Cells and weights of the filters that each pair reads."""
         return ConvGeometry(
-            edges,
+            edges if self.coincident == "neighbors" else edges.apart(),
             self.kernel_size,
             mapping=self.mapping,
             window=self.window,

@@ -73,6 +73,11 @@ class CountedCost:
             bytes_per_particle=self.bytes_per_particle + other.bytes_per_particle,
         )
 
+    def __mul__(self, times: float) -> "CountedCost":
+        return CountedCost(
+            flops_per_particle=times * self.flops_per_particle, bytes_per_particle=times * self.bytes_per_particle
+        )
+
 
 def total(parts: Iterable[CountedCost]) -> CountedCost:
     """Sum of costs."""

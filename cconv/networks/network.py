@@ -1,9 +1,9 @@
 """The base classes of networks: settings that build them, geometry, counted cost, and linear terms."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, TypeVar, overload
+from typing import ClassVar, Generic, Literal, NoReturn, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -24,10 +24,13 @@ from cconv.networks.counting import (
 )
 from cconv.nn.continuous_conv import ConvGeometry
 from cconv.nn.kinds import Kinds
+from cconv.nn.layers import Layers
+from cconv.nn.message_passing import PairGeometry
 from cconv.nn.radial_conv import RadialGeometry
+from cconv.nn.steerable import SteerableGeometry
 from cconv.validation import Flag, Real, StrictModel, Whole
 
-Geometry = ConvGeometry | RadialGeometry
+Geometry = ConvGeometry | RadialGeometry | PairGeometry | SteerableGeometry
 GeometryT = TypeVar("GeometryT", bound=Geometry)
 Layer = TypeVar("Layer", bound=nn.Module)
 Width = TypeVar("Width", int, Kinds)
@@ -76,25 +79,6 @@ class WallInputs(Generic[GeometryT]):
     geometry: GeometryT
 
 
-class Layers(nn.ModuleList, Generic[Layer]):
-    """A list of layers of one type, which keeps the type that `torch.nn.ModuleList` forgets."""
-
-    def __init__(self, layers: Iterable[Layer]):
-        super().__init__(layers)
-
-    @overload
-    def __getitem__(self, index: slice) -> "Layers[Layer]": ...
-
-    @overload
-    def __getitem__(self, index: int) -> Layer: ...
-
-    def __getitem__(self, index: Any) -> Any:
-        return super().__getitem__(index)
-
-    def __iter__(self) -> Iterator[Layer]:
-        return (self[index] for index in range(len(self)))
-
-
 class LinearTerms(ABC, Generic[GeometryT]):
     """A network of a single layer as a linear function of its coefficients, for least squares."""
 
@@ -111,6 +95,20 @@ class LinearTerms(ABC, Generic[GeometryT]):
     @abstractmethod
     def assign(self, coefficients: Sequence[Float[Tensor, "P C"]]) -> None:
         """Make coefficients (P, C) of each set those of the network."""
+
+
+def varying(inputs: Kinds) -> Kinds:
+    """Return the inputs without the constant, the first scalar, for networks with biases in its place."""
+    return Kinds(inputs.scalars - 1, inputs.vectors)
+
+
+def refuse_linear_terms(architecture: str) -> NoReturn:
+    """Refuse the closed form of a network that is linear in its coefficients in no setting.
+
+    Raises:
+        ConfigError: Always.
+    """
+    raise ConfigError(f"`network.architecture` {architecture!r} has no closed form; train it.")
 
 
 def assign_rows(weights: Sequence[Tensor], values: Float[Tensor, "P C"]) -> None:
@@ -196,6 +194,7 @@ class NetworkSettings(StrictModel, ABC):
     linear_with: ClassVar[Mapping[str, int]] = {}  # settings that make it linear in its coefficients, where some do
     linear_settings: ClassVar[tuple[str, ...]] = ()  # further settings that matter then
     basis_size: ClassVar[str]  # the one of them that says how many basis functions a filter has
+    includes_self: ClassVar[bool] = False  # whether a fluid particle is its own neighbour
 
     architecture: str
     relative_cutoff: Real = Field(2.25, ge=1e-3, le=10)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from cconv.batching import means_of_windows
 from cconv.errors import ConfigError, check_choice
 from cconv.neighbors import Edges
-from cconv.networks.conv_net import ACTIVATIONS
 from cconv.networks.counting import (
     ARRAY,
     FLOAT,
@@ -26,14 +25,15 @@ from cconv.networks.network import (
     Channels,
     ConvolutionNetwork,
     ConvolutionSettings,
-    Layers,
     LinearTerms,
     WallInputs,
     assign_rows,
     check_single_layer,
     with_inputs,
 )
+from cconv.nn.activations import ACTIVATIONS
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
+from cconv.nn.layers import Layers
 from cconv.nn.radial_conv import RadialConv, RadialGeometry
 from cconv.ops.radial import MOST_READS, num_reads
 from cconv.validation import Flag, Whole

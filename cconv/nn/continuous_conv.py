@@ -20,7 +20,7 @@ from copy import copy
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from cconv.errors import ConfigError, ShapeError, check_choice, check_shape
@@ -109,6 +109,11 @@ class ConvGeometry:
     def num_cells(self) -> int:
         """Number of cells of the filter grid, K^D."""
         return self.reads.num_cells
+
+    @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.reads.row_splits.diff() - int(self.includes_self)
 
     @property
     def nbytes(self) -> int:

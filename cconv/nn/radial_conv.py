@@ -107,6 +107,11 @@ class RadialGeometry:
         return self.edges.num_receivers
 
     @property
+    def neighbor_counts(self) -> Int[Tensor, " N"]:
+        """Number of neighbours of each receiver, itself not counted, (N,)."""
+        return self.edges.neighbor_counts
+
+    @property
     def nbytes(self) -> int:
         """Largest memory in bytes: with all that convolutions could add on first use, of which most need little."""
         edges = self.edges

@@ -6,9 +6,12 @@ from cconv.errors import check_choice
 from cconv.tasks.acceleration import Acceleration
 from cconv.tasks.density_gradient import DensityGradient
 from cconv.tasks.density_rate import DensityRate
+from cconv.tasks.position_correction import PositionCorrection
 from cconv.tasks.task import FieldTask, Task, as_step
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (DensityRate, DensityGradient, Acceleration)}
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (DensityRate, DensityGradient, Acceleration, PositionCorrection)
+}
 
 
 def field_tasks() -> list[FieldTask]:

@@ -8,6 +8,7 @@ from cconv.tasks.features import (
     FORCE,
     PARTICLE_TYPE,
     PRESSURE_SOURCE,
+    TYPE_ONE_HOT,
     VELOCITY,
     WALL_DISTANCE,
     WALL_NORMAL,
@@ -24,8 +25,9 @@ class Acceleration(StepTask):
     Features: the velocity, the last displacement, which networks know only as differences where their messages take
     differences of vectors; the `history - 2` accelerations before; SPH density; the source of the pressure, which tells
     a single linear layer what pressure the motion calls for; whether a particle is one of a wall; how near the nearest
-    wall point is and the direction away from the walls, both within the support radius of the task's kernel; the
-    external force at the particle's place. Wall particles have velocities as well: the difference from a lid that
+    wall point is and the direction away from the walls, both within the support radius of the task's kernel; the type
+    as nine zeros and ones, of which networks learn an embedding, only where it is asked for; the external force at the
+    particle's place. Wall particles have velocities as well: the difference from a lid that
     slides is its velocity relative to the fluid, and needs no feature of its own. Source: Sanchez-Gonzalez et al.,
     "Learning to Simulate Complex Physics with Graph Networks" (ICML 2020), section 4.1, whose velocities are those
     sums, with distances to walls clipped at the cutoff; LagrangeBench (Toshev et al., 2023).
@@ -44,13 +46,25 @@ class Acceleration(StepTask):
         PRESSURE_SOURCE,
         PARTICLE_TYPE,
         WALL_DISTANCE,
+        TYPE_ONE_HOT,
         ACCELERATIONS,
         FORCE,
         WALL_NORMAL,
         VELOCITY,
         WALLS,
     )
-    optional = (DENSITY, PRESSURE_SOURCE, PARTICLE_TYPE, WALL_DISTANCE, ACCELERATIONS, FORCE, WALL_NORMAL, WALLS)
+    optional = (
+        DENSITY,
+        PRESSURE_SOURCE,
+        PARTICLE_TYPE,
+        WALL_DISTANCE,
+        TYPE_ONE_HOT,
+        ACCELERATIONS,
+        FORCE,
+        WALL_NORMAL,
+        WALLS,
+    )
+    on_request = (TYPE_ONE_HOT,)
     checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
     moved_by = SemiImplicitEuler()
 

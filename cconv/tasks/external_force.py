@@ -30,6 +30,10 @@ class WithExternalForce:
     integrator: Integrator
     force: Accelerating
 
+    def before(self, window: Window, scene: Scene) -> Window:
+        """The window as the integrator that is added to asks about it."""
+        return self.integrator.before(window, scene)
+
     def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
         """The window a frame later; arguments as of `Integrator.advance`.
 
@@ -59,6 +63,10 @@ class WithForceOfScene:
 
     integrator: Integrator
     travel: float
+
+    def before(self, window: Window, scene: Scene) -> Window:
+        """The window as the integrator that is added to asks about it."""
+        return self.integrator.before(window, scene)
 
     def advance(self, window: Window, prediction: Tensor, scene: Scene) -> Window:
         """The window a frame later; arguments as of `Integrator.advance`.

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, one_hot
 
 from cconv.batching import counts_of
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
@@ -22,8 +22,10 @@ from cconv.sph.operators import density, velocity_gradient
 from cconv.tasks.inputs import Features, Inputs, Units, spread_densities, units_of
 
 CONSTANT, DENSITY, PARTICLE_TYPE, NORMAL = "one", "density", "particle_type", "normal"  # names of features
+TYPE_ONE_HOT = "type_one_hot"
 ACCELERATIONS, FORCE, VELOCITY = "accelerations", "force", "velocity"
 PRESSURE_SOURCE, WALL_DISTANCE, WALL_NORMAL = "pressure_source", "wall_distance", "wall_normal"
+NUM_TYPES = 9  # that LagrangeBench counts
 WALLS = "walls"  # stands among the features of a task for those of the wall points
 
 
@@ -44,8 +46,9 @@ def features_in(names: Sequence[str], history: int) -> tuple[str, ...]:
 
 def kinds_of(names: Sequence[str], history: int = 1) -> Kinds:
     """How many of some features are scalars and how many vectors, in windows of some frames."""
+    scalars = (NUM_TYPES if name == TYPE_ONE_HOT else 1 for name in names if name in _SCALARS)
     vectors = (history - 2 if name == ACCELERATIONS else 1 for name in names if name in _VECTORS)
-    return Kinds(sum(name in _SCALARS for name in names), sum(vectors))
+    return Kinds(sum(scalars), sum(vectors))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,17 +113,22 @@ class WindowState(FluidState):
 
     Attributes:
         accelerations: Second differences of the positions ÷ Δt², newest first, (N, H - 2, D).
-        is_fluid: Which particles are fluid, (N,), bool.
+        particle_types: Values of `ParticleType`, (N,).
         wall_points: Points that represent the walls now (B, D); none in a scene without walls.
         forces: External acceleration at each particle (N, D), 0 in a scene without a force.
         wall_batch_index: Window that each wall point belongs to, (B,), if there are several; None for one.
     """
 
     accelerations: Float[Tensor, "N K D"]
-    is_fluid: Bool[Tensor, " N"]
+    particle_types: Int[Tensor, " N"]
     wall_points: Float[Tensor, "B D"]
     forces: Float[Tensor, "N D"]
     wall_batch_index: Int[Tensor, " B"] | None = None
+
+    @property
+    def is_fluid(self) -> Bool[Tensor, " N"]:
+        """Which particles are fluid, (N,)."""
+        return self.particle_types == ParticleType.FLUID
 
     @property
     def fluid_masses(self) -> Float[Tensor, " M"]:
@@ -224,7 +232,7 @@ def window_state(
         box=scene.box,
         kernel=kernel,
         accelerations=(velocities.diff(dim=0) / scene.frame_dt).flip(0).transpose(0, 1),
-        is_fluid=window.is_fluid,
+        particle_types=window.particle_types,
         wall_points=positions[~window.is_fluid] if boundary is None else boundary.positions.double(),
         forces=torch.zeros_like(positions) if scene.force is None else scene.force(positions),
         batch_index=index,
@@ -233,12 +241,13 @@ def window_state(
 
 
 # The velocity is the last of the vectors: networks that know it only as differences leave out the last.
-_SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) of a state
+_SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) or (N, S) of a state
     CONSTANT: lambda state, units: torch.ones_like(state.masses),
     DENSITY: lambda state, units: (state.densities[:, None] / units.density)[:, 0],
     PRESSURE_SOURCE: lambda state, units: state.pressure_sources * units.time**2,
     PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
     WALL_DISTANCE: lambda state, units: state.wall_distances,
+    TYPE_ONE_HOT: lambda state, units: one_hot(state.particle_types.clamp(0, NUM_TYPES - 1), NUM_TYPES).double(),
 }
 _VECTORS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N, V, D) of a state
     ACCELERATIONS: lambda state, units: state.accelerations / units.acceleration,
@@ -274,10 +283,11 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
 def _particle_features(state: FluidState, units: Units, names: Collection[str]) -> Features:
     scalars = {name: feature(state, units) for name, feature in _SCALARS.items() if name in names}
     vectors = {name: feature(state, units) for name, feature in _VECTORS.items() if name in names}
+    columns = {name: values.reshape(len(values), -1) for name, values in scalars.items()}
     return Features(
-        scalars=torch.stack([*scalars.values()], dim=1).float(),
+        scalars=torch.cat([*columns.values()], dim=1).float(),
         vectors=torch.cat([*vectors.values()], dim=1).float(),
-        scalar_names=tuple(scalars),
+        scalar_names=tuple(name for name, values in columns.items() for _ in range(values.shape[1])),
         vector_names=tuple(name for name, values in vectors.items() for _ in range(values.shape[1])),
     )
 

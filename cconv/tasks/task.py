@@ -47,6 +47,7 @@ class Task(ABC):
     output: ClassVar[Kinds]
     features: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[str, ...]]  # which models may do without
+    on_request: ClassVar[tuple[str, ...]] = ()  # those of them that models have only where a study names them
     checks: ClassVar[tuple[str, ...]]  # of stability, that models must pass: names in `cconv.evaluation.checks`
     histories: ClassVar[tuple[int, int]] = (1, 1)  # the shortest and the longest
 
@@ -209,13 +210,15 @@ class StepTask(Task):
         return self.integrator.target(window, scene)
 
     def inputs(self, observed: Window, scene: Scene, names: Collection[str]) -> Inputs:
-        """What a network that takes some features is given of a window, or of the one that the predictor leads to.
+        """What a network that takes some features is given of a window as the integrator, or a predictor, moves it.
 
         Wall particles are particles like others, which send and receive, but no answer is asked for them. Boundary
         points count only where there are none.
         """
         known = None if self.predictor is None else self.predictor.answer(observed, scene)
-        if known is not None:
+        if known is None:
+            observed = self.integrator.before(observed, scene)
+        else:
             observed = self.integrator.advance(observed, known, scene)
         kernel = self.kernel_at(scene.particle_spacing, scene.dim)
         boundary = observed.boundary if bool(observed.is_fluid.all()) else None

@@ -1,4 +1,4 @@
-"""The training loop: Adam on the weighted mean squared error of standardised targets."""
+"""The training loop: Adam on a loss of standardised targets."""
 
 import math
 import time
@@ -17,7 +17,7 @@ from cconv.training.averages import begin_average, update_average
 from cconv.training.batches import batches
 from cconv.training.examples import Examples
 from cconv.training.geometry_cache import GeometryCache
-from cconv.training.losses import LOSSES, FrameWeight, loss_of
+from cconv.training.losses import LOSSES, Loss
 from cconv.training.progress import Progress, begin
 from cconv.training.unroll import unrolled
 
@@ -156,14 +156,14 @@ def _update(
     batch: Sequence[Sample],
     optimizer: torch.optim.Optimizer,
     geometry: GeometryCache,
-    weight: FrameWeight,
+    loss_of: Loss,
     steps: int,
 ) -> float:
     """Take one step on the mean loss of a batch, graph by graph, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     frames, total = sum(len(sample.origins) for sample in batch), 0.0
     for sample in batch:
-        loss = torch.stack(losses_of(model, sample, geometry, weight, steps)).sum() / frames
+        loss = torch.stack(losses_of(model, sample, geometry, loss_of, steps)).sum() / frames
         loss.backward()
         total += loss.item()
     if math.isfinite(total):
@@ -172,7 +172,7 @@ def _update(
 
 
 def losses_of(
-    model: Model, sample: Sample, geometry: Callable[[Sample], FrameGeometry], weight: FrameWeight, steps: int
+    model: Model, sample: Sample, geometry: Callable[[Sample], FrameGeometry], loss_of: Loss, steps: int
 ) -> list[Float[Tensor, ""]]:
     """Loss of each frame of a sample, the mean over its steps.
 
@@ -180,11 +180,11 @@ def losses_of(
         model: The model.
         sample: One frame, or several in one graph.
         geometry: Function from a sample to its geometry, e.g. a cache.
-        weight: How much a frame counts, by its own target.
+        loss_of: Loss of a frame.
         steps: Steps that are learned at once, of the model's own rollout.
     """
     losses: list[list[Tensor]] = [[] for _ in sample.origins]
     for answers in unrolled(model, sample, steps, geometry):
-        for window, prediction, target in answers:
-            losses[window].append(loss_of(prediction, target, weight))
+        for window, *answer in answers:
+            losses[window].append(loss_of(*answer))
     return [torch.stack(each).mean() for each in losses]

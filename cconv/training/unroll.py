@@ -64,11 +64,13 @@ class Answered(NamedTuple):
         window: Number of the window, among several in one graph.
         prediction: Standardised prediction (M, C).
         target: Standardised target (M, C).
+        neighbors: Number of neighbours of each particle, itself not counted, (M,).
     """
 
     window: int
     prediction: Tensor
     target: Tensor
+    neighbors: Tensor
 
 
 def unrolled(
@@ -88,22 +90,27 @@ def unrolled(
         geometry: Function from a sample to its geometry, e.g. a cache.
     """
     numbers = list(range(len(sample.origins)))
-    prediction = model(sample.inputs, geometry(sample))
-    yield _answers(model, sample, prediction, numbers)
+    seen = geometry(sample)
+    prediction = model(sample.inputs, seen)
+    yield _answers(model, sample, prediction, seen, numbers)
     for _ in range(steps - 1):
         following = _followed(model, sample, prediction)
         if following is None:
             return
         sample, kept = following
         numbers = [number for number, keep in zip(numbers, kept, strict=True) if keep]
-        prediction = model(sample.inputs, model.geometry(sample.inputs))
-        yield _answers(model, sample, prediction, numbers)
+        seen = model.geometry(sample.inputs)
+        prediction = model(sample.inputs, seen)
+        yield _answers(model, sample, prediction, seen, numbers)
 
 
-def _answers(model: Model, sample: Sample, prediction: Tensor, numbers: Sequence[int]) -> list[Answered]:
+def _answers(
+    model: Model, sample: Sample, prediction: Tensor, seen: FrameGeometry, numbers: Sequence[int]
+) -> list[Answered]:
     """Answers about windows with some numbers."""
-    counts = sample.inputs.answer_counts
-    parts = prediction.split(counts), model.standardize_target(sample.target).split(counts)
+    counts, answered = sample.inputs.answer_counts, sample.inputs.answered
+    neighbors = seen.fluid.neighbor_counts if answered is None else seen.fluid.neighbor_counts[answered]
+    parts = prediction.split(counts), model.standardize_target(sample.target).split(counts), neighbors.split(counts)
     return [Answered(*each) for each in zip(numbers, *parts, strict=True)]
 
 

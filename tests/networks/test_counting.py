@@ -4,10 +4,12 @@ from dataclasses import replace as with_changes
 import pytest
 import torch
 from systems import configured, model_of, periodic_frame, periodic_scene, with_walls
+from torch.utils.flop_counter import FlopCounterMode
 
 from cconv.evaluation.cost import flops_per_particle, neighbor_density
 from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import NeighborDensity, ball_volume
+from cconv.networks.network import ConvolutionNetwork
 from cconv.nn import ContinuousConv
 from cconv.nn.kinds import Kinds
 from cconv.ops import radial
@@ -26,6 +28,12 @@ RADIAL = [
     configured(architecture="radial_net", **SEVERAL, walls=False),
     configured(architecture="radial_net", layers=3, first_channels=3, hidden_channels=24, radial_terms=5),
 ]
+GRAPHS = [
+    configured(architecture="gns", layers=2, hidden_channels=6, embedding=5),
+    configured(architecture="gns", layers=1, hidden_channels=7, mlp_layers=3, walls=False),
+    configured(architecture="segnn", layers=2, hidden_channels=5),
+    configured(architecture="segnn", layers=1, hidden_channels=4, readout_layers=2, walls=False),
+]
 
 
 def built(network, task, normals, generator):
@@ -39,6 +47,8 @@ def built(network, task, normals, generator):
 def counted_on(model, inputs):
     """Operations of a built model, from its weights and the pairs of its geometry."""
     geometry, network = model.geometry(inputs), model.network
+    if not isinstance(network, ConvolutionNetwork):
+        return of_matrix_products(network, *model.network_inputs(inputs, geometry)) / inputs.num_particles
     convs = [(conv, geometry.fluid) for conv in network.convs]
     if network.boundary_conv is not None:
         convs.append((network.boundary_conv, geometry.walls))
@@ -48,6 +58,14 @@ def counted_on(model, inputs):
             repeated = model.config.dim if name == "vector_weights" else 1
             total += 0 if name == "bias" else 2 * repeated * weights.numel()
     return total
+
+
+@torch.no_grad()
+def of_matrix_products(network, *inputs):
+    """Operations of all matrix products of a network, as torch counts them."""
+    with FlopCounterMode(display=False) as counter:
+        network(*inputs)
+    return counter.get_total_flops()
 
 
 def of_conv(conv, geometry):
@@ -75,7 +93,7 @@ def of_reads(filters, reads):
 @pytest.mark.parametrize("normals", [True, False])
 @pytest.mark.parametrize("task", ["density_rate", "density_gradient"])
 @pytest.mark.parametrize(
-    "network", GRID + RADIAL, ids=lambda each: f"{each.network.architecture}-{each.network.layers}"
+    "network", GRID + RADIAL + GRAPHS, ids=lambda each: f"{each.network.architecture}-{each.network.layers}"
 )
 def test_equals_the_count_on_a_built_model(network, task, normals, generator):
     model, inputs = built(network, task, normals, generator)
@@ -83,7 +101,7 @@ def test_equals_the_count_on_a_built_model(network, task, normals, generator):
 
 
 def test_the_count_of_every_architecture_is_checked():
-    assert {each.network.architecture for each in GRID + RADIAL} == set(ARCHITECTURES)
+    assert {each.network.architecture for each in GRID + RADIAL + GRAPHS} == set(ARCHITECTURES)
 
 
 def surroundings():

@@ -10,6 +10,7 @@ from cconv.data.trajectory import ParticleType
 from cconv.errors import ConfigError, ShapeError
 from cconv.forces import ConstantForce, ReversePoiseuilleForce
 from cconv.nn.kinds import Kinds
+from cconv.study.declared.configuration import TaskConfig
 from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples, make_step_sample
 
@@ -42,7 +43,7 @@ def test_velocity_and_accelerations_are_the_history_newest_first(generator):
     expected = steps.diff(dim=0).flip(0).transpose(0, 1)
     torch.testing.assert_close(column(features, "accelerations").double(), expected, rtol=1e-4, atol=1e-5)
     assert features.vector_names[-1] == "velocity"  # networks that know it as differences leave out the last vector
-    assert features.kinds == TASK.kinds(TASK.features) == Kinds(5, 7)
+    assert features.kinds == TASK.kinds(TASK.features) == Kinds(14, 7)
 
 
 def test_a_uniform_motion_leaves_everything_but_the_velocity(generator):
@@ -123,3 +124,13 @@ def test_a_force_that_depends_on_the_place_is_that_of_each_particle(generator):
     assert {-1.0, 1.0} == set(signs.tolist())
     expected = torch.stack([2.0 * signs * scene.frame_dt**2 / scene.particle_spacing, torch.zeros(64)], dim=1)
     torch.testing.assert_close(forces, expected)
+
+
+def test_types_are_ones_and_zeros_where_they_are_asked_for(generator):
+    types = torch.arange(64) % 4
+    sample, _, _ = sample_of(generator, particle_types=types)
+    features = sample.inputs.features
+    columns = [place for place, name in enumerate(features.scalar_names) if name == "type_one_hot"]
+    assert torch.equal(features.scalars[:, columns], torch.eye(9)[types])
+    assert "type_one_hot" not in TaskConfig(name="acceleration").taken
+    assert "type_one_hot" in TaskConfig(name="acceleration", features=("velocity", "type_one_hot")).taken

@@ -9,17 +9,21 @@ from systems import periodic_scene, periodic_trajectory
 
 from cconv.data.trajectory import ParticleType
 from cconv.data.window import window_at
+from cconv.forces import ConstantForce
 from cconv.rollout.rollout import advance
-from cconv.tasks.integrators import SemiImplicitEuler
+from cconv.tasks.integrators import CorrectedFall, SemiImplicitEuler
 
-EULER = SemiImplicitEuler()
+EULER, FALL = SemiImplicitEuler(), CorrectedFall()
+WEIGHT = ConstantForce((30.0, -500.0))  # hundredths of a spacing per frame squared
 
 
-def test_replayed_targets_are_the_stored_frames(generator):
+@pytest.mark.parametrize("force", [None, WEIGHT])
+@pytest.mark.parametrize("integrator", [EULER, FALL])
+def test_replayed_targets_are_the_stored_frames(integrator, force, generator):
     """Also through periodic faces: the frames are independent of each other, so particles jump anywhere."""
-    scene, trajectory = periodic_scene(), periodic_trajectory(generator, num_frames=6)
+    scene, trajectory = replace(periodic_scene(), force=force), periodic_trajectory(generator, num_frames=6)
     start = window_at(trajectory, 1, history=2, future=4)
-    replayed = list(itertools.islice(advance(EULER.target, EULER, start, scene), 4))
+    replayed = list(itertools.islice(advance(integrator.target, integrator, start, scene), 4))
     for window, stored in zip(replayed, trajectory.positions[2:], strict=True):
         error = scene.box.displacement(window.present.double(), stored.double())
         assert error.abs().max() < 1e-6
@@ -45,13 +49,27 @@ def test_a_constant_acceleration_is_integrated_as_a_parabola():
     assert torch.allclose(torch.stack([window.present for window in path]), positions[2:])
 
 
+def test_a_fall_is_that_of_the_force_during_a_frame(generator):
+    """Networks are asked about the place that particles fall to, and the velocity that they then have."""
+    scene, trajectory = replace(periodic_scene(), force=WEIGHT), periodic_trajectory(generator, num_frames=4)
+    window = window_at(trajectory, 3, history=4, future=0)
+    fall = scene.frame_dt**2 * torch.tensor(WEIGHT.acceleration, dtype=torch.float64)
+    velocities = window.last_displacements(scene.box)
+    later = FALL.before(window, scene)
+    assert later.positions.shape == window.positions.shape
+    torch.testing.assert_close(later.present, window.present + velocities + fall / 2)
+    torch.testing.assert_close(later.last_displacements(scene.box), velocities + fall, atol=1e-6, rtol=0)
+    assert FALL.advance(window, torch.zeros(64, 2), scene).frame == window.frame + 1
+
+
+@pytest.mark.parametrize("integrator", [EULER, FALL])
 @pytest.mark.parametrize("kind", [ParticleType.SOLID_WALL, ParticleType.MOVING_WALL])
-def test_particles_that_are_no_fluid_repeat_their_last_displacement(kind, generator):
-    scene, trajectory = periodic_scene(), periodic_trajectory(generator, num_frames=2)
+def test_particles_that_are_no_fluid_repeat_their_last_displacement(kind, integrator, generator):
+    scene, trajectory = replace(periodic_scene(), force=WEIGHT), periodic_trajectory(generator, num_frames=2)
     types = trajectory.particle_types.clone()
     types[:8] = kind
     window = window_at(replace(trajectory, particle_types=types), 1, history=2, future=0)
-    later = EULER.advance(window, torch.ones(len(types) - 8, 2), scene)
+    later = integrator.advance(window, torch.ones(len(types) - 8, 2), scene)
     now = window.positions[:, :8].double()
     expected = scene.box.displacement(now[1], now[0])
     assert torch.allclose(scene.box.displacement(later.present[:8].double(), now[1]), expected, atol=1e-6)

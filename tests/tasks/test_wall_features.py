@@ -114,7 +114,7 @@ def test_a_scene_without_walls_has_no_wall_inputs(walled, generator):
     sample = make_step_sample(window_of(with_walls(frame) if walled else frame, generator), scene, TASK)
     absent = absent_features(TASK, TASK.features, [sample])
     wall_features = {"wall_distance", "wall_normal"}
-    assert absent == {"particle_type", "force", "accelerations"} | (set() if walled else wall_features)
+    assert absent == {"particle_type", "type_one_hot", "force", "accelerations"} | (set() if walled else wall_features)
 
 
 def test_no_walls_are_searched_for_models_that_are_not_told_of_them(generator):

@@ -143,7 +143,7 @@ def test_a_window_that_diverges_leaves_the_others_to_go_on_unrolled(generator):
         return convert(prediction, inputs) * factors.repeat_interleave(torch.tensor(counts))[:, None]
 
     model.in_units_of_data = breaking
-    learned = partial(losses_of, model, geometry=lambda each: model.geometry(each.inputs), weight=LOSSES["mse"])
+    learned = partial(losses_of, model, geometry=lambda each: model.geometry(each.inputs), loss_of=LOSSES["mse"])
     together = torch.stack(learned(joined, steps=3)).detach()
     apart = torch.stack([loss for sample in samples for loss in learned(sample, steps=3)]).detach()
     first_steps = torch.stack(learned(joined, steps=1)).detach()

@@ -80,7 +80,7 @@ def errors_of(model, sample, steps):
     unit = model.target_scale[0] * sample.target_unit
     return [
         float((prediction - target).detach().square().mean().sqrt() * unit)
-        for [(_, prediction, target)] in unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))
+        for [(_, prediction, target, _)] in unrolled(model, sample, steps, lambda each: model.geometry(each.inputs))
     ]
 
 
@@ -99,7 +99,7 @@ def test_gradients_of_unrolled_steps_are_those_of_finite_differences(samples, eq
     weights = next(model.parameters())
 
     def last_error():
-        *_, [(_, prediction, target)] = unrolled(model, sample, 3, lambda each: model.geometry(each.inputs))
+        *_, [(_, prediction, target, _)] = unrolled(model, sample, 3, lambda each: model.geometry(each.inputs))
         return (prediction - target).square().mean()
 
     (gradient,) = torch.autograd.grad(last_error(), weights)

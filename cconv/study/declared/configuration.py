@@ -39,15 +39,17 @@ HYPERPARAMETERS = (
 Settings = TypeVar("Settings", bound=StrictModel)
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 Noise = Annotated[Real, Field(ge=0, le=1)]  # standard deviation of the last velocity's, particle spacings per frame
-Loss = Literal["mse", "balanced_mse"]
+SquaredLoss = Literal["mse", "balanced_mse"]
+Loss = Literal["mse", "balanced_mse", "neighbor_weighted"]
 
 
 class TaskConfig(StrictModel):
     """What is asked of a network: the task, its SPH kernel, and the features that networks are given.
 
     `smoothing_length` is the kernel's h in the units of the data; None takes the particle spacing. `features` None
-    takes all features of the task. A step task also has `history`, the frames that an answer depends on, and
-    `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as LagrangeBench.
+    takes all features of the task but those that are on request. A step task also has `history`, the frames that an
+    answer depends on, and `horizon`, the frames of the rollouts that models are compared by; None takes 6 and 20, as
+    LagrangeBench.
     `external_force` says whether the network learns it, or the integrator adds it and the network learns the rest.
     """
 
@@ -90,8 +92,9 @@ class TaskConfig(StrictModel):
     @property
     def taken(self) -> tuple[str, ...]:
         """Features that networks are given."""
-        known = TASKS[self.name].features
-        return known if self.features is None else tuple(name for name in known if name in (CONSTANT, *self.features))
+        task = TASKS[self.name]
+        wanted = {*task.features} - {*task.on_request} if self.features is None else {CONSTANT, *self.features}
+        return tuple(name for name in task.features if name in wanted)
 
     @property
     def usual_history(self) -> int:
@@ -102,12 +105,13 @@ class TaskConfig(StrictModel):
 class TrainingConfig(StrictModel):
     """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
 
-    `loss` says how much each frame counts. `noise`, for step tasks, is the standard deviation of the random walk that
-    is added to the velocities of a window, in particle spacings per frame. `pushforward` is the largest number of steps
-    that the model's own rollout goes on before the step that it learns from, once a share `pushforward_from` of the
-    updates is done. `unroll` is the number of steps of that rollout that it then learns from at once, with gradients
-    through all of them, once a share `unroll_from` of the updates is done. `average` is the decay of a moving average
-    of the weights, which is evaluated and kept in their place; 0 keeps the weights themselves.
+    `loss` says how much each frame counts, or with "neighbor_weighted" each particle. `noise`, for step tasks, is the
+    standard deviation of the random walk that is added to the velocities of a window, in particle spacings per frame.
+    `pushforward` is the largest number of steps that the model's own rollout goes on before the step that it learns
+    from, once a share `pushforward_from` of the updates is done. `unroll` is the number of steps of that rollout that
+    it then learns from at once, with gradients through all of them, once a share `unroll_from` of the updates is done.
+    `average` is the decay of a moving average of the weights, which is evaluated and kept in their place; 0 keeps the
+    weights themselves.
     """
 
     updates: Updates = 600

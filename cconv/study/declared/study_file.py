@@ -15,8 +15,8 @@ from cconv.study.declared.configuration import (
     HISTORY,
     WITH_PREDICTOR,
     Configuration,
-    Loss,
     Noise,
+    SquaredLoss,
     TaskConfig,
     TrainingConfig,
     Updates,
@@ -78,7 +78,7 @@ class PredictorConfig(StrictModel):
 
     network: NetworkTable
     noise: Noise = 1e-2
-    loss: Loss = "balanced_mse"
+    loss: SquaredLoss = "balanced_mse"
     ridge: Ridge = 1e-10
 
     @field_validator("network")

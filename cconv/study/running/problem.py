@@ -33,7 +33,7 @@ from cconv.tasks.samples import (
 from cconv.tasks.task import StepTask, Task, as_field, as_step
 from cconv.training.augmentation import RandomWalkNoise
 from cconv.training.examples import AugmentedExamples, Examples, StoredExamples
-from cconv.training.losses import LOSSES
+from cconv.training.losses import frame_weight
 from cconv.training.unroll import Pushforward
 from cconv.validation import PathText, check_setting, validated
 
@@ -136,7 +136,7 @@ class Problem:
         """
         examples = self.examples(training, seed, model.task)
         drawn = (sample for place in places for sample in examples.draw([place], 0, model))
-        solve_closed_form(model, drawn, ridge, weight=LOSSES[training.loss])
+        solve_closed_form(model, drawn, ridge, weight=frame_weight(training.loss))
 
     @cached_property
     def present_features(self) -> tuple[str, ...]:

@@ -208,7 +208,7 @@ def test_what_is_no_regular_file_is_refused_without_reading_it(tmp_path):
         ("task.smoothing_length=1e300", r"`task\.smoothing_length`: input should be less than"),
         (
             "task.name=density_rat",
-            r"`task\.name`: input should be 'density_rate', 'density_gradient' or 'acceleration'",
+            r"`task\.name`: input should be 'density_rate', 'density_gradient', 'acceleration' or 'position_",
         ),
         ('task.features=["velocity", "densit"]', "no feature 'densit'. Did you mean 'density'"),
         ('task.features=["walls"]', "the feature 'velocity' must be one of `features`"),
