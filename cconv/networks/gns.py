@@ -130,6 +130,11 @@ class GNSSettings(NetworkSettings):
     embedding: Whole = Field(16, ge=1, le=1024)
     activation: Literal["relu", "gelu", "tanh", "leaky_relu"] = "relu"
 
+    @property
+    def in_words(self) -> str:
+        """Its steps and width, as the published GNS-10-128 is named."""
+        return f"GNS of {self.layers} steps, {self.hidden_channels} wide"
+
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> GNS:

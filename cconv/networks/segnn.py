@@ -143,6 +143,11 @@ class SEGNNSettings(NetworkSettings):
     hidden_channels: Whole = Field(32, ge=1, le=4096)
     readout_layers: Whole = Field(1, ge=0, le=8)
 
+    @property
+    def in_words(self) -> str:
+        """Its steps and width; the published SEGNN-10-64 has 32 scalars and vectors."""
+        return f"SEGNN of {self.layers} steps, {self.hidden_channels} scalars and vectors wide"
+
     def build(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, generator: torch.Generator | None = None
     ) -> SEGNN:
