@@ -25,6 +25,7 @@ from cconv.study.running.ray_pool import private_ray
 OLDEST_PYTHON, NEWEST_PYTHON = (3, 11), (3, 13)
 LEAST_DISK, LEAST_TEMPORARY, LEAST_MEMORY = 2e9, 1e9, 4e9  # bytes; a study of the published sizes needs as much
 EXTRAS = {  # packages that are not needed, and what they are for
+    "e3nn": "the network SEGNN (pip install 'cconv[segnn]')",
     "open3d": "the comparison with Open3D's layers (pip install 'cconv[parity]')",
     "psycopg": "Optuna studies in PostgreSQL (pip install 'cconv[cluster]')",
 }
