@@ -47,7 +47,9 @@ def _block(translator: Any, node: nodes.Element) -> None:
 
 def _refuse_foreign(app: Sphinx, error: Exception | None) -> None:
     """Refuse a site that fetches scripts, styles, fonts or pictures from elsewhere when a page is opened."""
-    fetched = re.compile(r"""<(?:script|img|iframe|link)[^>]*(?:src|href)=["'](?:https?:)?//|url\(["']?(?:https?:)?//""")
+    fetched = re.compile(
+        r"""<(?:script|img|iframe|link)[^>]*(?:src|href)=["'](?:https?:)?//|url\(["']?(?:https?:)?//"""
+    )
     for path in [path for path in Path(app.outdir).rglob("*") if path.suffix in (".html", ".css")]:
         if error is None and (found := fetched.search(path.read_text(encoding="utf-8"))):
             raise ExtensionError(f"{path}: fetches something from another server: {found[0]}")
