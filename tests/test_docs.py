@@ -84,9 +84,7 @@ def test_the_commands_of_the_tutorial_run_one_after_another(cconv, flow_folder, 
     for line in tried:
         status, _, error = cconv(*shlex.split(line)[1:])
         assert status == 0, (line, error)
-    assert {"CONVERTED", "LAYER", "frames.png", "flow.gif"} <= {
-        path.name for path in working_folder.iterdir()
-    }
+    assert {"CONVERTED", "LAYER", "frames.png", "flow.gif"} <= {path.name for path in working_folder.iterdir()}
 
 
 @pytest.mark.integration

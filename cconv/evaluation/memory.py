@@ -38,7 +38,8 @@ def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame | Window, scene: 
 
     On Linux they are forked from this one, so that imports happen once; elsewhere forking is not safe with threads.
     """
-    context, found = get_context("fork" if sys.platform == "linux" else "spawn"), []
+    context = get_context("fork") if sys.platform == "linux" else get_context("spawn")
+    found: list[float] = []
     for path in paths:
         receiver, sender = context.Pipe(duplex=False)
         child = context.Process(target=_send_growth, args=(sender, load, path, frame, scene, threads))

@@ -85,8 +85,7 @@ def run_trial(
                         return
                     continue
                 entry = _entry(state)
-                error = entry["valid_error"]
-                if error is not None and error < best:
+                if (error := entry["valid_error"]) is not None and error < best:
                     best = error
                     save_model(state.model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
                 folder.append(entry)
