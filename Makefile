@@ -4,6 +4,7 @@
 # make test    environment, whole test suite, on all cores
 # make test-slow   what takes hours: clusters, kills, cold compilation, a thousand inputs
 # make check   environment, lint, format and types
+# make docs    environment and the documentation site in site/
 # make data    environment and the data of the quick study, made by the SPH solver
 
 PYTHON ?= python3.11
@@ -15,7 +16,7 @@ DATA := runs/data/dam_break_2d
 VORTICES := runs/data/taylor_green_2d
 ROLLED := runs/rollout
 
-.PHONY: study rollout test test-fast test-slow check data clean
+.PHONY: study rollout test test-fast test-slow check docs data clean
 
 study: $(VENV)/.installed $(DATA)/metadata.json
 	$(VENV)/bin/cconv study run $(STUDY) --data $(DATA) --out $(RUN) --overwrite
@@ -39,6 +40,10 @@ check: $(VENV)/.installed
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 
+docs: $(VENV)/.installed-docs
+	rm -rf site
+	$(VENV)/bin/sphinx-build -q --fail-on-warning --keep-going -c docs -d $(VENV)/doctrees . site
+
 data: $(DATA)/metadata.json
 
 $(DATA)/metadata.json: $(VENV)/.installed
@@ -54,5 +59,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) runs site

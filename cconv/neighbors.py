@@ -26,7 +26,7 @@ class Edges:
         receivers: Index i of the particle that gathers, (E,), int64, ascending.
         senders: Index j of its neighbour, (E,), int64, ascending within a receiver.
         displacements: x_i - x_j with minimum image, (E, D).
-        distances: |x_i - x_j|, (E,).
+        distances: their lengths, (E,).
         row_splits: Pairs of receiver i stand at ``row_splits[i]:row_splits[i + 1]``, (receivers + 1,), int64.
         num_senders: Number of points that could send.
         cutoff: Largest distance listed, inclusive.

@@ -1,14 +1,16 @@
 """What the command line prints: its version, and every foreign string as it is."""
 
 import json
+import os
 import subprocess
 import sys
 from importlib.metadata import version
 
 import numpy as np
 import pytest
-from conftest import SMOKE
+from conftest import SCRIPT, SMOKE
 from outcomes import assert_one_clear_line
+from processes import PATIENCE
 from rich.table import Table
 from rich.text import Text
 
@@ -51,6 +53,21 @@ def test_the_commands_are_listed_with_what_they_are_for(cconv):
     assert status == 0
     assert "Find the smallest, fastest continuous-convolution network" in out
     assert all(command in out for command in ("train", "fit", "evaluate", "report", "data", "study", "--version"))
+
+
+@pytest.mark.integration
+def test_a_shell_is_told_how_to_complete_and_what(tmp_path):
+    def run(*arguments, **variables):
+        known = os.environ | {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+        command = [SCRIPT, *arguments]
+        return subprocess.run(command, env=known | variables, capture_output=True, text=True, timeout=PATIENCE)
+
+    assert run("--install-completion", "bash").returncode == 0
+    assert "_CCONV_COMPLETE" in (tmp_path / ".bash_completions" / "cconv.sh").read_text()
+    asked = {"_CCONV_COMPLETE": "complete_bash", "COMP_WORDS": "cconv data ins", "COMP_CWORD": "2"}
+    assert run(**asked).stdout.split() == ["inspect"]
+    refused = run("--install-completion", "nosuch")
+    assert_one_clear_line((refused.returncode, refused.stdout, refused.stderr), "nosuch")
 
 
 def test_foreign_strings_are_printed_as_they_are(console):

@@ -21,7 +21,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",  # wraps paragraphs
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")

@@ -278,11 +278,24 @@ def recommended_checkpoint(path: Path) -> Path:
     return path / run.summary().offered_checkpoint
 
 
-def report(path: RunPath) -> None:
-    """Write report.html of a run again, also for an interrupted run."""
+def report(
+    path: RunPath,
+    tables: Annotated[
+        Path | None,
+        typer.Option(
+            "--tables",
+            metavar="DIR",
+            help="Folder to write tables to: trials, curves, finalists and others as CSV, and as Parquet where pyarrow "
+            "is installed.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace older tables in DIR.")] = False,
+) -> None:
+    """Write report.html of a run again, also for an interrupted run; with --tables also its records as tables."""
     from jinja2 import TemplateError
 
     from cconv.report.page import write_report
+    from cconv.report.table_files import write_tables
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.studies import recorded_space, recorded_study
 
@@ -290,6 +303,7 @@ def report(path: RunPath) -> None:
     recorded_study(run), recorded_space(run)  # checks them, because the page may show every key
     try:
         written = write_report(run)
+        files = [] if tables is None else write_tables(run, tables, overwrite)
     except CConvError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, TemplateError) as error:
@@ -299,6 +313,8 @@ def report(path: RunPath) -> None:
             f"({reason}); restore it, or run the study again."
         ) from error
     results.print(f"Report: {written}", soft_wrap=True)
+    if files:
+        results.print(f"Tables: {len(files)} files in {tables}", soft_wrap=True)
 
 
 def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:

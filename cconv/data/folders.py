@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from cconv.errors import ConfigError
 from cconv.files import replacing
 
@@ -60,7 +62,7 @@ def check_free(folder: Path, files: Iterable[str], overwrite: bool) -> None:
     present = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if present - files and overwrite:
         others = ", ".join(sorted(present - files)[:3])
-        raise ConfigError(f"{folder}: holds other things than a data set ({others}); name another folder.")
+        raise ConfigError(f"{folder}: holds other files than are to be replaced ({others}); name another folder.")
     if present and not overwrite:
         raise ConfigError(f"{folder}: exists and is not empty; name another folder or overwrite it.")
 
@@ -70,7 +72,7 @@ def _remove_left_behind(folder: Path) -> None:
     left = re.compile(rf"\.{re.escape(folder.name)}\.(\d+)\.partial(\.old)?")
     for path in folder.parent.iterdir():
         match = left.fullmatch(path.name)
-        if match and not Path("/proc", match[1]).exists():
+        if match and not psutil.pid_exists(int(match[1])):
             shutil.rmtree(path, ignore_errors=True)
 
 

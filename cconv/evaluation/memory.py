@@ -1,6 +1,6 @@
 """Memory of a prediction, measured in a separate process for each model."""
 
-import resource
+import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -34,8 +34,12 @@ def peak_megabytes(
 
 
 def _of_each(load: Load, paths: tuple[Path, ...], frame: Frame | Window, scene: Scene, threads: int) -> list[float]:
-    """Run one process after another, one for each model, forked from this one so that imports happen once."""
-    context, found = get_context("fork"), []
+    """Run one process after another, one for each model.
+
+    On Linux they are forked from this one, so that imports happen once; elsewhere forking is not safe with threads.
+    """
+    context = get_context("fork") if sys.platform == "linux" else get_context("spawn")
+    found: list[float] = []
     for path in paths:
         receiver, sender = context.Pipe(duplex=False)
         child = context.Process(target=_send_growth, args=(sender, load, path, frame, scene, threads))
@@ -59,6 +63,8 @@ def peak_resident_megabytes() -> float:
     """Return the peak memory of this process; on Linux from /proc, as `getrusage` would return the parent's peak."""
     status = Path("/proc/self/status")
     if not status.is_file():
+        import resource  # which Unix has alone
+
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024

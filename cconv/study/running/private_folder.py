@@ -1,8 +1,8 @@
 """Private folders of short names for the files of Ray; also runs without Ray delete those of killed runs."""
 
-import fcntl
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -11,7 +11,7 @@ from pathlib import Path
 from cconv.errors import ConfigError
 
 PREFIX = "cconv-"
-LONGEST_SOCKET = 107  # bytes of a socket's path that Linux takes
+LONGEST_SOCKET = 103 if sys.platform == "darwin" else 107  # bytes of a socket's path that the system takes
 SESSION = "/ray/session_2026-01-01_00-00-00_000000_0000000/sockets/plasma_store"  # the longest that Ray appends
 
 
@@ -64,6 +64,8 @@ def _locked(folder: Path) -> Iterator[bool]:
 
 
 def _lock(descriptor: int) -> bool:
+    import fcntl  # which Unix has alone
+
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

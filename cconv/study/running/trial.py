@@ -10,6 +10,7 @@ from cconv.models.checkpoint import read_card, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import Configuration, TrainingConfig, configure
 from cconv.study.records.trials import TrialFolder
+from cconv.study.running.event_file import event_file
 from cconv.study.running.problem import Problem
 from cconv.training.loop import Optimization, TrainingState, train
 from cconv.training.progress import Progress, begin, load_progress, save_progress
@@ -46,15 +47,16 @@ def run_trial(
 ) -> Iterator[dict]:
     """Train one configuration, or continue its training, and yield an entry at every evaluation.
 
-    Before an entry is yielded, everything is on disk: the log, the progress from which a killed training continues, and
-    the checkpoint with the smallest validation error so far. On Ctrl-C before the first evaluation the checkpoint is
-    the model at that moment. A loss that is not finite ends the trial with an entry whose ``diverged`` is true.
+    Before an entry is yielded, everything is on disk: the log, the same for TensorBoard, the progress from which a
+    killed training continues, and the checkpoint with the smallest validation error so far. On Ctrl-C before the first
+    evaluation the checkpoint is the model at that moment. A loss that is not finite ends the trial with an entry whose
+    ``diverged`` is true.
 
     Args:
         problem: Scene, task and samples.
         trial: The configuration and its records.
         defaults: Configuration of the study, for hyperparameters that the trial does not set.
-        folder: Folder for config.json, log.jsonl, progress.safetensors and checkpoint/.
+        folder: Folder for config.json, log.jsonl, its event file, progress.safetensors and checkpoint/.
         seconds_limit: Time limit of the whole training, which ends at the first update after it.
         on_update: Function that is called with the state after every update.
     """
@@ -75,20 +77,21 @@ def run_trial(
         progress=progress,
     )
     try:
-        for state in states:
-            on_update(state)
-            if state.valid_error is None and not state.diverged:
-                if state.seconds > seconds_limit:
-                    return
-                continue
-            entry = _entry(state)
-            error = entry["valid_error"]
-            if error is not None and error < best:
-                best = error
-                save_model(state.model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
-            folder.append(entry)
-            save_progress(folder.progress, model, progress)
-            yield entry
+        with event_file(folder.path, folder.log()) as events:
+            for state in states:
+                on_update(state)
+                if state.valid_error is None and not state.diverged:
+                    if state.seconds > seconds_limit:
+                        return
+                    continue
+                entry = _entry(state)
+                if (error := entry["valid_error"]) is not None and error < best:
+                    best = error
+                    save_model(state.model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
+                folder.append(entry)
+                events.append(entry)
+                save_progress(folder.progress, model, progress)
+                yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
             save_model(progress.average or model, folder.checkpoint, card | {"valid_error": None})

@@ -14,6 +14,7 @@ from troubles import BrokenJudge, jobs_in, study_of, trained_in, troubled_proble
 
 from cconv.errors import ConfigError
 from cconv.study.records.trials import TrialFolder
+from cconv.study.running.event_file import EVENT_FILE
 from cconv.study.running.ray_pool import STARTS, RayPool, _Driver, _start, ray_pool
 from cconv.study.running.trial_queue import TrialQueue
 
@@ -50,7 +51,8 @@ def test_one_that_fails_is_recorded_with_its_reason_and_others_go_to_the_full_bu
     for seed in (0, 10):
         folder = tmp_path / f"trial_{seed}"
         assert [entry["updates"] for entry in TrialFolder(folder).log()] == [1, 2]
-        assert {path.name for path in folder.iterdir()} == {"config.json", "log.jsonl", "outcome.json", "checkpoint"}
+        files = {"config.json", "log.jsonl", EVENT_FILE, "outcome.json", "checkpoint"}
+        assert {path.name for path in folder.iterdir()} == files
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, trained_in, t
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import load_model
 from cconv.study.records.trials import TrialFolder
+from cconv.study.running.event_file import EVENT_FILE
 from cconv.study.running.serial_pool import SerialPool
 from cconv.study.running.trial_queue import TrialQueue
 
@@ -35,7 +36,8 @@ def test_one_that_fails_is_recorded_with_its_reason_and_others_go_to_the_full_bu
     for seed in (0, 10):
         folder = tmp_path / f"trial_{seed}"
         assert [entry["updates"] for entry in TrialFolder(folder).log()] == [1, 2]
-        assert {path.name for path in folder.iterdir()} == {"config.json", "log.jsonl", "outcome.json", "checkpoint"}
+        files = {"config.json", "log.jsonl", EVENT_FILE, "outcome.json", "checkpoint"}
+        assert {path.name for path in folder.iterdir()} == files
     assert TrialFolder(tmp_path / "trial_1").read().config["stage"] == "random"
 
 
