@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from summaries import SAMPLE, changed, explanation, minimal_summary, rollouts, whole_summary
+from summaries import SAMPLE, changed, explanation, minimal_summary, relaxations, rollouts, whole_summary
 
 from cconv.report import page
 from cconv.report.page import render_report, write_report
@@ -112,6 +112,19 @@ def test_the_answer_says_where_analytic_sph_is_cheaper_and_exact(other_run, ms, 
     summary = other_run.summary()
     other_run.write_summary(changed(summary, analytic=changed(summary.analytic, ms_per_frame=ms)))
     assert ("It is cheaper than the recommended model, and exact" in words(render_report(other_run))) == says
+
+
+@pytest.mark.parametrize(("failures", "says"), [((), True), (("too dense 0.1 (limit 0.02)",), False)])
+def test_the_report_says_whether_the_relaxed_model_is_stable(other_run, failures, says, no_charts):
+    summary = other_run.summary()
+    shaky = changed(summary.chosen, stability=changed(summary.chosen.stability, stable=False, failures=("x",)))
+    finalists = [shaky if entry.id == shaky.id else entry for entry in summary.finalists]
+    relaxed = changed(relaxations(summary.recommended.id), failures=failures)
+    other_run.write_summary(changed(summary, finalists=finalists, relaxed=relaxed))
+    text = words(render_report(other_run))
+    assert ("Relaxed, it is stable" in text) == says
+    assert ("it passes every check of stability, which it does not without" in text) == says
+    assert all(failure in text for failure in failures)
 
 
 def test_analytic_sph_and_the_densitys_symbols_are_not_spoken_of_where_the_task_has_none(run, no_charts):

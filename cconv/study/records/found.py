@@ -334,11 +334,13 @@ class Relaxed(StrictModel):
         models: What was tried, by finalist.
         chosen: Number of the chosen one of these, by finalist; 0 is none.
         checkpoint: Folder of the recommended model with its relaxation, relative to the run folder; None without one.
+        failures: A line for each check of stability that this model fails; None if it was not checked.
     """
 
     models: dict[Id, RelaxedModel]
     chosen: dict[Id, Count]
     checkpoint: InnerPath | None
+    failures: tuple[str, ...] | None = None
 
     @model_validator(mode="after")
     def _the_chosen_were_tried(self) -> "Relaxed":

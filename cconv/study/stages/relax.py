@@ -1,7 +1,7 @@
 """The relax stage finds the SPH relaxation with which the recommended model rolls out best, without any retraining.
 
 Relaxations are compared by validation rollouts of the recommended finalist and of the most accurate one; the test split
-is not read.
+is not read. The relaxed model then has to pass the checks of stability as the finalists had.
 """
 
 import shutil
@@ -12,6 +12,7 @@ from typing import Literal
 from pydantic import Field
 
 from cconv.data.splits import evenly_spaced
+from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.relaxed_rollouts import FlowErrors, flow_errors, mean_errors, relative_quality
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.model import Model
@@ -23,6 +24,7 @@ from cconv.study.records.found import Found, Relaxed, RelaxedModel, TriedRelaxat
 from cconv.study.records.relaxations import read_tried, write_tried
 from cconv.study.records.summary import FinalistEntry, Summary
 from cconv.study.running.relaxation_search import propose_relaxation
+from cconv.study.stages.checked import stability_checks
 from cconv.study.stages.session import Session
 from cconv.tasks.samples import StepSample, rolled_samples
 from cconv.tasks.task import StepTask, as_step
@@ -67,7 +69,8 @@ class RelaxStage(Stage):
         shutil.rmtree(session.run.path / OFFERED, ignore_errors=True)  # of a choice before the study was extended
         own = models[summary.recommended.id].tried[chosen[summary.recommended.id]]
         checkpoint = _offer(session, summary, own) if own.loops else None
-        found = Relaxed(models=models, chosen=chosen, checkpoint=checkpoint)
+        failures = None if checkpoint is None else _failures(session, checkpoint)
+        found = Relaxed(models=models, chosen=chosen, checkpoint=checkpoint, failures=failures)
         seconds = summary.wall_seconds + time.perf_counter() - begun
         session.run.write_summary(summary.model_copy(update={"relaxed": found, "wall_seconds": seconds}))
         return Found(relaxed=found)
@@ -130,6 +133,14 @@ def _try(
         reason=reasons[0] if reasons else "",
         seconds=time.perf_counter() - begun,
     )
+
+
+def _failures(session: Session, checkpoint: str) -> tuple[str, ...]:
+    """Run the checks of stability on the relaxed model; a line for each that it fails."""
+    model = load_model(session.run.path / checkpoint)
+    material, checks = stability_checks(session, model.cutoff)
+    seeds = {OFFERED: material.predictor(model)}
+    return tuple(measure_stability(seeds, checks, material.counts)["failures"])
 
 
 def _offer(session: Session, summary: Summary, chosen: TriedRelaxation) -> str:

@@ -12,7 +12,6 @@ from torch import Tensor
 from cconv.data.splits import evenly_spaced
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.window import window_at
-from cconv.evaluation.checks import make_checks, material_for
 from cconv.evaluation.checks.rolled import SeriesCheck
 from cconv.evaluation.recorded_rollout import RecordedRollout, asked_rollout, record_rollout, write_rollout
 from cconv.evaluation.rollout_comparison import FlowMetrics
@@ -27,6 +26,7 @@ from cconv.study.records.rollouts import (
     RolledTrajectory,
     write_rollouts,
 )
+from cconv.study.stages.checked import stability_checks
 from cconv.study.stages.finalists import Retrained
 from cconv.study.stages.session import Session
 from cconv.tasks.task import StepTask
@@ -55,9 +55,8 @@ def record_rollouts(session: Session, finalists: Sequence[Retrained], recommende
 
 def _series_checks(session: Session, finalists: Sequence[Retrained]) -> list[SeriesCheck]:
     """Make the checks that look at every frame; their limits come from validation trajectories, as in the stage."""
-    trajectories, scene = list(session.dataset.trajectories("valid")), session.dataset.scene
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    checks = make_checks(material_for(session.problem.task, trajectories, scene, reach))
+    _, checks = stability_checks(session, reach)
     return [check for check in checks if isinstance(check, SeriesCheck)]
 
 

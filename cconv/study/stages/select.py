@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
-from cconv.evaluation.checks import make_checks, material_for
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
@@ -45,6 +44,7 @@ from cconv.study.records.summary import (
 from cconv.study.records.trials import count_outcomes
 from cconv.study.running.counted_costs import points_of_search
 from cconv.study.running.problem import study_samples
+from cconv.study.stages.checked import stability_checks
 from cconv.study.stages.finalists import (
     Retrained,
     check_any_finished,
@@ -275,11 +275,8 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
 
     All frames come from validation trajectories; the test split is only read for its errors.
     """
-    problem, scene = session.problem, session.dataset.scene
-    trajectories = list(session.dataset.trajectories("valid"))
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
-    material = material_for(problem.task, trajectories, scene, reach)
-    checks = make_checks(material)
+    material, checks = stability_checks(session, reach)
     found = {
         finalist.id: Stability(**measure_stability(_of_seeds(finalist, material.predictor), checks, material.counts))
         for finalist in session.progress(finalists, "stability")

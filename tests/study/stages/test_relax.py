@@ -12,6 +12,7 @@ from cconv.models.checkpoint import load_model, save_model
 from cconv.study.records.relaxations import read_tried
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.stages import relax
+from cconv.study.stages.checked import stability_checks
 from cconv.study.stages.relax import RelaxStage
 from cconv.study.studies import Study
 from cconv.validation import validated
@@ -85,6 +86,21 @@ def test_the_recommended_model_is_offered_with_the_choice_and_without_one_as_it_
     else:
         assert (found.checkpoint, config.relaxation) == (None, None)
         assert not (session.run.path / "relaxed").exists()
+
+
+def test_the_relaxed_model_is_checked_as_finalists_are(session, monkeypatch):
+    monkeypatch.setattr(relax, "chosen_relaxation", lambda tried: 1)
+    found = run_stage(session)
+    material, checks = stability_checks(session, load_model(session.run.path / "relaxed").cutoff)
+    model = load_model(session.run.path / "relaxed")
+    assert found.failures == tuple(
+        check.in_words(each)
+        for check in checks
+        for each in check.findings(material.predictor(model))
+        if not each.passes
+    )
+    monkeypatch.setattr(relax, "chosen_relaxation", lambda tried: 0)
+    assert run_stage(session).failures is None
 
 
 def test_a_leap_is_a_recorded_failure_and_never_the_choice(session, monkeypatch):
