@@ -61,6 +61,12 @@ class Edges:
         """Number of space dimensions D."""
         return self.displacements.shape[1]
 
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        tensors = (self.receivers, self.senders, self.displacements, self.distances, self.row_splits)
+        return sum(tensor.nbytes for tensor in tensors)
+
     def __len__(self) -> int:
         return len(self.receivers)
 

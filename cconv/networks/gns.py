@@ -17,9 +17,9 @@ from cconv.neighbors import Edges
 from cconv.networks.counting import CountedCost, NeighborDensity, count_arrays, count_linear, count_search, total
 from cconv.networks.network import (
     Channels,
+    GraphSettings,
     LinearTerms,
     Network,
-    NetworkSettings,
     WallInputs,
     refuse_linear_terms,
     varying,
@@ -29,7 +29,7 @@ from cconv.nn.activations import ACTIVATIONS
 from cconv.nn.kinds import Kinds, split_kinds
 from cconv.nn.layers import Layers
 from cconv.nn.message_passing import MLP, MessagePassing, PairGeometry, segment_sums
-from cconv.validation import Real, Whole
+from cconv.validation import Whole
 
 
 class GNS(Network[PairGeometry]):
@@ -112,19 +112,14 @@ def _embedding(inputs: int, outputs: int, generator: torch.Generator | None) -> 
     return weights
 
 
-class GNSSettings(NetworkSettings):
+class GNSSettings(GraphSettings):
     """Hyperparameters of a `GNS`; the defaults are those of the published GNS-10-128.
 
-    `layers` is the number of steps of message passing, `hidden_channels` the width of latent values and hidden layers,
-    `mlp_layers` the number of hidden layers of each multilayer perceptron, `embedding` the width of the embedded
-    scalars.
+    `hidden_channels` is the width of latent values and hidden layers, `mlp_layers` the number of hidden layers of each
+    multilayer perceptron, `embedding` the width of the embedded scalars.
     """
 
-    includes_self = True
-
     architecture: Literal["gns"] = "gns"
-    relative_cutoff: Real = Field(1.45, ge=1e-3, le=10)
-    layers: Whole = Field(10, ge=1, le=64)
     hidden_channels: Whole = Field(128, ge=1, le=4096)
     mlp_layers: Whole = Field(1, ge=1, le=8)
     embedding: Whole = Field(16, ge=1, le=1024)
@@ -149,17 +144,9 @@ class GNSSettings(NetworkSettings):
             generator=generator,
         )
 
-    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
-        """Scalars without the constant, which biases replace, then vectors."""
-        return features[:, 1:]
-
     def geometry(self, edges: Edges) -> PairGeometry:
         """Relative displacement and distance of each pair."""
         return PairGeometry(edges)
-
-    def has_intercept(self, outputs: Kinds) -> bool:
-        """There are biases."""
-        return True
 
     def count(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity

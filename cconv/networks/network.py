@@ -237,6 +237,26 @@ class NetworkSettings(StrictModel, ABC):
         """Count the cost of a prediction per particle from its features; arguments as of `build`, and point density."""
 
 
+class GraphSettings(NetworkSettings):
+    """The common settings of graph networks, which pass messages between encoder and decoder.
+
+    `layers` is the number of steps of message passing; a particle is its own neighbour, as in LagrangeBench.
+    """
+
+    includes_self = True
+
+    relative_cutoff: Real = Field(1.45, ge=1e-3, le=10)
+    layers: Whole = Field(10, ge=1, le=64)
+
+    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
+        """Scalars without the constant, which biases replace, then vectors."""
+        return features[:, 1:]
+
+    def has_intercept(self, outputs: Kinds) -> bool:
+        """There are biases, of scalars at least."""
+        return True
+
+
 class ConvolutionSettings(NetworkSettings):
     """The common settings of networks of stacked convolutions.
 

@@ -15,9 +15,9 @@ from cconv.neighbors import Edges
 from cconv.networks.counting import ARRAY, CountedCost, NeighborDensity, count_arrays, count_search, total
 from cconv.networks.network import (
     Channels,
+    GraphSettings,
     LinearTerms,
     Network,
-    NetworkSettings,
     WallInputs,
     refuse_linear_terms,
     varying,
@@ -36,7 +36,7 @@ from cconv.nn.steerable import (
     side_by_side,
     spherical_harmonics,
 )
-from cconv.validation import Real, Whole
+from cconv.validation import Whole
 
 
 class SEGNN(Network[SteerableGeometry]):
@@ -126,20 +126,17 @@ def _steerable(values: Tensor, kinds: Kinds, dim: int) -> Steerable:
     return Steerable(scalars, in_space(vectors).transpose(1, 2))
 
 
-class SEGNNSettings(NetworkSettings):
+class SEGNNSettings(GraphSettings):
     """Hyperparameters of a `SEGNN`; the defaults are those of the published SEGNN-10-64.
 
-    `layers` is the number of steps of message passing, `hidden_channels` the number of scalars and of vectors (32 of
-    each are the published 64 units), `readout_layers` the number of gated blocks after the last step: the published
-    numbers of parameters are those of one, the published code builds two.
+    `hidden_channels` is the number of scalars and of vectors (32 of each are the published 64 units), `readout_layers`
+    the number of gated blocks after the last step: the published numbers of parameters are those of one, the published
+    code builds two.
     """
 
     is_equivariant = True
-    includes_self = True
 
     architecture: Literal["segnn"] = "segnn"
-    relative_cutoff: Real = Field(1.45, ge=1e-3, le=10)
-    layers: Whole = Field(10, ge=1, le=64)
     hidden_channels: Whole = Field(32, ge=1, le=4096)
     readout_layers: Whole = Field(1, ge=0, le=8)
 
@@ -161,17 +158,9 @@ class SEGNNSettings(NetworkSettings):
             generator=generator,
         )
 
-    def arrange(self, features: Float[Tensor, "N C"], kinds: Kinds, dim: int) -> Float[Tensor, "N C_in"]:
-        """Scalars without the constant, which biases replace, then vectors."""
-        return features[:, 1:]
-
     def geometry(self, edges: Edges) -> SteerableGeometry:
         """Displacement, distance and attribute of each pair."""
         return SteerableGeometry(edges, spherical_harmonics())
-
-    def has_intercept(self, outputs: Kinds) -> bool:
-        """There are biases of scalars."""
-        return True
 
     def count(
         self, inputs: Kinds, walls: Kinds | None, outputs: Kinds, dim: int, around: NeighborDensity

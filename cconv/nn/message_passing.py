@@ -56,9 +56,7 @@ class PairGeometry:
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        edges = self.edges
-        tensors = (edges.receivers, edges.senders, edges.displacements, edges.distances, edges.row_splits)
-        return self.features.nbytes + sum(tensor.nbytes for tensor in tensors)
+        return self.features.nbytes + self.edges.nbytes
 
 
 def segment_sums(values: Float[Tensor, "E C"], row_splits: Int[Tensor, " splits"]) -> Float[Tensor, "N C"]:

@@ -124,10 +124,8 @@ class SteerableGeometry:
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        edges = self.edges
-        tensors = (edges.receivers, edges.senders, edges.displacements, edges.distances, edges.row_splits)
         own = (self.relative.scalars, self.relative.vectors, self.attributes, self.mean_attributes)
-        return sum(tensor.nbytes for tensor in (*tensors, *own))
+        return self.edges.nbytes + sum(tensor.nbytes for tensor in own)
 
 
 class SteeredLinear(nn.Module):

@@ -53,17 +53,7 @@ class Acceleration(StepTask):
         VELOCITY,
         WALLS,
     )
-    optional = (
-        DENSITY,
-        PRESSURE_SOURCE,
-        PARTICLE_TYPE,
-        WALL_DISTANCE,
-        TYPE_ONE_HOT,
-        ACCELERATIONS,
-        FORCE,
-        WALL_NORMAL,
-        WALLS,
-    )
+    optional = tuple(name for name in features if name not in (CONSTANT, VELOCITY))
     on_request = (TYPE_ONE_HOT,)
     checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
     moved_by = SemiImplicitEuler()
