@@ -304,11 +304,11 @@ class Model(nn.Module):
         return self.task.inputs(frame, scene, self.config.features)
 
     def _check_walls(self, window: Window) -> None:
-        absent = set(self.config.wall_types) - set(window.particle_types.tolist())
+        absent = [kind for kind in self.config.wall_types if not (window.particle_types == kind).any()]
         if absent:
-            names = " and ".join(str(ParticleType(each).name).lower().replace("_", " ") for each in sorted(absent))
+            names = " and ".join(str(ParticleType(kind).name).lower().replace("_", " ") for kind in absent)
             raise ShapeError(
-                f"The model was trained beside particles of type {names} ({', '.join(map(str, sorted(absent)))}), and "
+                f"The model was trained beside particles of type {names} ({', '.join(map(str, absent))}), and "
                 "the data have none; add them to the files, or use a checkpoint of a scene without them."
             )
 

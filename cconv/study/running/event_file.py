@@ -32,9 +32,8 @@ class EventFile:
         self._last: Mapping = {"updates": 0, "seconds": 0.0}
         self._writer: RecordWriter | None = None
         try:
-            self._writer = RecordWriter(
-                str(folder.absolute() / EVENT_FILE)
-            )  # a relative name may mean a cloud's storage
+            # A relative name may mean a cloud's storage.
+            self._writer = RecordWriter(str(folder.absolute() / EVENT_FILE))
             self._write(Event(wall_time=self._begun, file_version=VERSION))
         except OSError:
             self._give_up()
