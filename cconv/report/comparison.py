@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from scipy.stats import ttest_ind
 
 from cconv.errors import ConfigError
+from cconv.evaluation.statistics import FEWEST
 from cconv.files import read_json, write_text
 from cconv.report.page import templates
 from cconv.report.plots import new_figure
@@ -20,7 +21,6 @@ from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.summary import FinalistEntry, Summary
 from cconv.validation import Name, OpenModel, validated
 
-FEWEST_SEEDS = 2  # trainings of either model that an interval of the difference needs
 NEEDED = 1.1  # ratio of errors from which on an input that was left out counts as needed
 
 
@@ -165,8 +165,8 @@ def _difference(run: ComparedRun, reference: ComparedRun) -> dict:
         return row | {"why_none": "an error is 0"}
     ours, theirs = (np.log(each) for each in errors)
     row["ratio"] = float(np.exp(ours.mean() - theirs.mean()))
-    if min(len(ours), len(theirs)) < FEWEST_SEEDS:
-        return row | {"why_none": f"fewer than {FEWEST_SEEDS} trainings of a model"}
+    if min(len(ours), len(theirs)) < FEWEST:
+        return row | {"why_none": f"fewer than {FEWEST} trainings of a model"}
     low, high = ttest_ind(ours, theirs, equal_var=False).confidence_interval()
     return row | {"ci95_low": math.exp(low), "ci95_high": math.exp(high)}
 

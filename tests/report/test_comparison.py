@@ -52,19 +52,21 @@ def test_the_solvers_time_is_a_multiple_of_the_models(runs):
 
 
 def test_twice_the_error_has_the_ratio_two_and_an_interval_around_it(runs):
-    reference, other = (with_errors(run, *(s * np.array([1.0, 1.2, 0.9]))) for run, s in zip(runs, (1, 2), strict=True))
+    reference, other = (
+        with_errors(run, *(s * np.array([1.0, 1.2, 0.9, 1.1]))) for run, s in zip(runs, (1, 2), strict=True)
+    )
     (row,) = differences_table([reference, other]).to_dict("records")
     assert row["ratio"] == pytest.approx(2)
     assert row["ci95_low"] < 2 < row["ci95_high"]
     assert row["ci95_low"] * row["ci95_high"] == pytest.approx(4)  # symmetric in logarithms
     (nearer,) = differences_table(
-        [with_errors(run, *(s * np.array([1.0, 1.01, 0.99]))) for run, s in zip(runs, (1, 2), strict=True)]
+        [with_errors(run, *(s * np.array([1.0, 1.01, 0.99, 1.0]))) for run, s in zip(runs, (1, 2), strict=True)]
     ).to_dict("records")
     assert row["ci95_low"] < nearer["ci95_low"] < 2
 
 
 @pytest.mark.parametrize(
-    ("errors", "reason"), [((1.0,), "fewer than 2 trainings of a model"), ((1.0, 0.0), "an error is 0")]
+    ("errors", "reason"), [((1.0, 2.0, 1.5), "fewer than 4 trainings of a model"), ((1.0, 0.0), "an error is 0")]
 )
 def test_what_has_no_interval_says_why(errors, reason, runs):
     (row,) = differences_table([with_errors(runs[0], 1.0, 2.0), with_errors(runs[1], *errors)]).to_dict("records")
