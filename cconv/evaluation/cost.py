@@ -21,6 +21,7 @@ from cconv.models.model import Model, ModelConfig
 from cconv.neighbors import radius_graph
 from cconv.networks.counting import CountedCost, NeighborDensity
 from cconv.ops.workers import torch_threads
+from cconv.rollout.correctors import correctors_of
 from cconv.sph.compiled import CompiledSums
 from cconv.tasks import task_named
 from cconv.tasks.features import FluidState
@@ -339,7 +340,7 @@ def _at_constant_velocity(frame: Frame, scene: Scene, history: int) -> Window:
 
 
 def _time_prediction(model: Model, frame: Frame | Window, scene: Scene) -> tuple[float, float]:
-    """Time `predict_frame` outside the network and inside it."""
+    """Time a prediction outside the network and inside it; what corrects a rollout of the model counts outside."""
     marks = []
     hooks = [
         model.network.register_forward_pre_hook(lambda *_: marks.append(time.perf_counter())),
@@ -347,6 +348,9 @@ def _time_prediction(model: Model, frame: Frame | Window, scene: Scene) -> tuple
     ]
     start = time.perf_counter()
     model.predict_frame(frame, scene)
+    if isinstance(frame, Window):
+        for corrector in correctors_of(model):
+            corrector(frame, frame, scene)
     total = time.perf_counter() - start
     for hook in hooks:
         hook.remove()

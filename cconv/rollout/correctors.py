@@ -42,7 +42,8 @@ class SPHRelaxation:
 
     Learned steps let particles cluster slowly, which the density shows and the error of a step does not. Whatever is
     not fluid counts as a wall and keeps its place; walls that are points, without particles, are not seen. Values to
-    start from are alpha 0.02 and 1 to 5 loops; too large ones shake the velocities that the model knows.
+    start from are alpha 0.02 and 1 to 5 loops; too large ones shake the velocities that the model knows. Derivatives
+    pass as if the shifts did not depend on the positions.
 
     Source: Toshev et al., "Neural SPH" (ICML 2024), eqs. 5 and 6; effects and values used are in its tables 1 to 3.
 
@@ -64,8 +65,9 @@ class SPHRelaxation:
 
     def __call__(self, before: Window, after: Window, scene: Scene) -> Window:
         """The window with its present relaxed; arguments as of `Corrector`."""
+        present = after.present
         relaxed = relax(
-            after.present,
+            present,
             before.present,
             ~after.is_fluid,
             box=scene.box,
@@ -74,4 +76,6 @@ class SPHRelaxation:
             beta=self.beta,
             loops=self.loops,
         )
+        if present.requires_grad:
+            relaxed = scene.box.wrap(present + scene.box.displacement(relaxed, present.detach()))
         return replace(after, positions=torch.cat([after.positions[:-1], relaxed[None]]))

@@ -119,8 +119,8 @@ def _followed(model: Model, sample: Sample, prediction: Tensor) -> tuple[StepSam
     if not isinstance(sample, StepSample) or len(sample.window.future) < 2:
         return None
     answer = model.in_units_of_data(prediction, sample.inputs)
-    start = begun(sample.window)
-    window, ends = followed(lambda window, scene: answer, sample.task.integrator, start, sample.scene)
+    start, correctors = begun(sample.window), correctors_of(model)
+    window, ends = followed(lambda window, scene: answer, sample.task.integrator, start, sample.scene, correctors)
     kept = [end is None for end in ends]
     if not any(kept):
         return None

@@ -4,6 +4,7 @@ import pytest
 import torch
 from systems import configured, model_of, periodic_frame, periodic_scene, window_of
 
+from cconv.models.relaxation import Relaxation
 from cconv.rollout.rollout import rollout
 from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples
@@ -51,6 +52,13 @@ def test_a_rollout_that_diverges_stays_where_it_came(samples):
 
     (window,) = pushed(Broken(), [samples.windows[0]], SCENE, [3])
     assert torch.equal(window.present, samples.windows[0].present)
+
+
+def test_a_relaxed_model_learns_from_where_its_relaxed_rollout_leads(samples, model):
+    start, relaxed = samples.windows[0], model.relaxed_by(Relaxation(alpha=0.02, beta=0.3, loops=2))
+    (window,) = pushed(relaxed, [start], SCENE, [1])
+    assert torch.equal(window.present, next(rollout(relaxed, start, SCENE)).present)
+    assert not torch.equal(window.present, next(rollout(model, start, SCENE)).present)
 
 
 def test_examples_are_never_pushed_beyond_what_is_stored(samples, model):
@@ -107,6 +115,24 @@ def test_gradients_of_unrolled_steps_are_those_of_finite_differences(samples, eq
     with torch.no_grad():
         after, before = (last_error() for sign in (1, -2) if weights.add_(sign * small * direction) is not None)
     assert float((after - before) / (2 * small)) == pytest.approx(float((gradient * direction).sum()), rel=1e-3)
+
+
+def test_unrolled_steps_of_a_relaxed_model_are_those_of_its_rollout(samples, equivariant):
+    """The window that the second step is asked about is relaxed; the first step's part in its error still counts."""
+    relaxed, start = equivariant.relaxed_by(Relaxation(alpha=0.02, beta=0.3, loops=2)), samples.windows[0]
+    path = rollout(relaxed, start, SCENE)
+    window = next(path)
+    answer = relaxed.predict_frame(window, SCENE)
+    following = TASK.integrator.advance(window, answer, SCENE)
+    off = SCENE.box.displacement(following.present, start.future[1].double())
+    found = errors_of(relaxed, samples[0], 2)
+    assert found[1] == pytest.approx(float(off.square().mean().sqrt()), rel=1e-4)
+    *_, [(_, prediction, target, _)] = unrolled(relaxed, samples[0], 2, lambda each: relaxed.geometry(each.inputs))
+    once, twice = (
+        torch.autograd.grad(loss, next(relaxed.parameters()), retain_graph=True)[0]
+        for loss in ((prediction - target).square().mean(), (prediction - target.detach()).square().mean())
+    )
+    assert not torch.allclose(once, twice)
 
 
 def test_unrolling_ends_where_nothing_is_stored_and_where_it_diverges(samples, model):

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NamedTuple, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from cconv.errors import ConfigError, did_you_mean, shown
+from cconv.models.relaxation import Relaxation
 from cconv.networks import ARCHITECTURES, ConvNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.sph.kernels import KERNELS
@@ -21,7 +22,7 @@ MOST_PUSHED = 20  # steps of a model's own rollout before the one that it learns
 STILL = {"noise": 0.0, "pushforward": 0, "unroll": 1}  # settings of a training, with which no particle is moved
 NETWORK, TRAINING, FEATURES = "network", "training", "task.features"  # tables that hold hyperparameters
 HISTORY, WITH_PREDICTOR = "task.history", "task.with_predictor"
-EXTERNAL_FORCE = "task.external_force"
+EXTERNAL_FORCE, RELAXATION = "task.external_force", "rollout.relaxation"
 BY_NETWORK, BY_INTEGRATOR = "network", "integrator"  # who knows of the external force
 ARCHITECTURE = f"{NETWORK}.architecture"
 OPTIONAL_FEATURES = tuple(dict.fromkeys(name for task in TASKS.values() for name in task.optional))
@@ -34,6 +35,7 @@ HYPERPARAMETERS = (
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
     *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
+    *(f"{RELAXATION}.{name}" for name in Relaxation.model_fields),
 )
 
 Settings = TypeVar("Settings", bound=StrictModel)
@@ -144,6 +146,7 @@ class Configuration(NamedTuple):
         training: Training settings.
         external_force: "network" if the network learns it, "integrator" if the integrator of a step adds it.
         with_predictor: Whether the network corrects the step of the study's predictor, if it has one.
+        relaxation: SPH relaxation after every step of rollouts, those of the training included; None without.
     """
 
     features: tuple[str, ...]
@@ -152,6 +155,7 @@ class Configuration(NamedTuple):
     training: TrainingConfig
     external_force: str = BY_NETWORK
     with_predictor: bool = False
+    relaxation: Relaxation | None = None
 
 
 DEFAULTS = Configuration(TASKS["density_rate"].features, 1, ConvNetSettings(), TrainingConfig())
@@ -192,6 +196,7 @@ def configure(parameters: Mapping[str, Value], defaults: Configuration) -> Confi
         _possible(TrainingConfig, TRAINING, defaults.training.model_dump() | below(TRAINING, parameters)),
         _external_force(parameters, defaults),
         _with_predictor(parameters, defaults),
+        _relaxation(parameters, defaults),
     )
 
 
@@ -210,6 +215,8 @@ def check_asked(configuration: Configuration, task: str) -> None:
         raise ConfigError(f"not possible ({HISTORY}: {error})") from error
     if configuration.external_force == BY_INTEGRATOR and not issubclass(TASKS[task], StepTask):
         raise ConfigError(f"not possible ({EXTERNAL_FORCE}: is for steps, and {task!r} is a field of one frame)")
+    if configuration.relaxation is not None and not issubclass(TASKS[task], StepTask):
+        raise ConfigError(f"not possible ({RELAXATION}: is for steps, and {task!r} is a field of one frame)")
     for name, value in configuration.training.moving.items():
         if not issubclass(TASKS[task], StepTask):
             allowed = f"must be {STILL[name]:g} for the field {task!r}"
@@ -267,6 +274,16 @@ def _with_predictor(parameters: Mapping[str, Value], defaults: Configuration) ->
     if not isinstance(with_predictor, bool):
         raise ConfigError(f"not possible ({WITH_PREDICTOR}: must be true or false, got {shown(with_predictor)})")
     return with_predictor
+
+
+def _relaxation(parameters: Mapping[str, Value], defaults: Configuration) -> Relaxation | None:
+    """The relaxation as drawn or as in the study; one of size 0 is none."""
+    drawn = below(RELAXATION, parameters)
+    if not drawn:
+        return defaults.relaxation
+    known = {} if defaults.relaxation is None else defaults.relaxation.model_dump()
+    relaxation = _possible(Relaxation, RELAXATION, known | drawn)
+    return relaxation if relaxation.alpha > 0 else None
 
 
 def _check_features(parameters: Mapping[str, Value]) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, field_validator, model_validator
 
 from cconv.errors import ConfigError
+from cconv.models.relaxation import Relaxation
 from cconv.networks import ConvNetSettings, NetworkTable
 from cconv.networks.network import NetworkSettings
 from cconv.study.declared.configuration import (
@@ -89,6 +90,12 @@ class PredictorConfig(StrictModel):
         return network
 
 
+class RolloutConfig(StrictModel):
+    """What rollouts of steps apply after every frame, those within a training and those that models are compared by."""
+
+    relaxation: Relaxation | None = None
+
+
 class FinalistsConfig(StrictModel):
     """Protocol of every retraining and test. `updates` None means the search's budget."""
 
@@ -146,6 +153,7 @@ class StudyConfig(StrictModel):
     network: NetworkTable = ConvNetSettings()
     predictor: PredictorConfig | None = None
     training: TrainingConfig = TrainingConfig()
+    rollout: RolloutConfig = RolloutConfig()
     search: SearchConfig
     finalists: FinalistsConfig = FinalistsConfig()
     cost: CostConfig = CostConfig()
@@ -218,8 +226,16 @@ class StudyConfig(StrictModel):
     @property
     def configuration(self) -> Configuration:
         """What trials have where no hyperparameter is drawn."""
-        task, corrects = self.task, self.predictor is not None
-        return Configuration(task.taken, task.usual_history, self.network, self.training, task.external_force, corrects)
+        task = self.task
+        return Configuration(
+            features=task.taken,
+            history=task.usual_history,
+            network=self.network,
+            training=self.training,
+            external_force=task.external_force,
+            with_predictor=self.predictor is not None,
+            relaxation=self.rollout.relaxation,
+        )
 
     def configured(self, parameters: Mapping[str, Value]) -> Configuration:
         """What a trial has for which these hyperparameters are drawn.

@@ -40,9 +40,10 @@ def with_predictor(
 
 def _fitted(problem: Problem, study: StudyConfig, asked: PredictorConfig, progress: Progress) -> Model:
     training = TrainingConfig(noise=asked.noise, loss=asked.loss)
-    model = problem.build_model(
-        study.configuration._replace(network=asked.network, training=training, with_predictor=False), study.seeds.init
+    alone = study.configuration._replace(
+        network=asked.network, training=training, with_predictor=False, relaxation=None
     )
+    model = problem.build_model(alone, study.seeds.init)
     places = progress(range(len(problem.train_samples)), "fit the predictor")
     problem.solve_closed_form(model, training, places, asked.ridge, study.seeds.data)
     return model.eval()

@@ -152,7 +152,7 @@ class Problem:
     def build_model(self, configuration: Configuration, init_seed: int) -> Model:
         """Build an untrained model with the initial weights of `init_seed`."""
         task = self.task_of(configuration)
-        return build_model(
+        model = build_model(
             configuration.network,
             task,
             self.features_of(configuration),
@@ -160,6 +160,7 @@ class Problem:
             self._typical(task),
             torch.Generator().manual_seed(init_seed),
         )
+        return model if configuration.relaxation is None else model.relaxed_by(configuration.relaxation)
 
 
 def open_study_data(data: DataConfig, data_seed: int) -> Dataset:

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from cconv.errors import ConfigError
+from cconv.models.relaxation import Relaxation
 from cconv.networks import RadialNetSettings
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import DEFAULTS, configure
@@ -391,3 +392,25 @@ def test_layers_of_a_huge_space_are_drawn_without_listing_them():
     assert 1000 < len(layers) <= MOST_LAYERS
     assert {layer["network.relative_cutoff"] for layer in layers} == set(choices["network.relative_cutoff"])
     assert layers == single_layers(space, network, 3)
+
+
+RELAXATION = (
+    '[parameters.rollout.relaxation.alpha]\ntype = "choice"\nvalues = [0.0, 0.02]\nbaseline = 0.02\nreason = "r"\n'
+)
+
+
+def test_the_relaxation_of_rollouts_is_a_hyperparameter_of_steps(space_file):
+    study = load_study(REPOSITORY / "experiments" / "rollout.toml", ["rollout.relaxation.alpha=0.01"])
+    assert study.configured({}).relaxation == Relaxation(alpha=0.01)
+    drawn = study.configured({"rollout.relaxation.alpha": 0.02, "rollout.relaxation.loops": 3})
+    assert drawn.relaxation == Relaxation(alpha=0.02, loops=3)
+    assert study.configured({"rollout.relaxation.alpha": 0.0}).relaxation is None
+    assert load_space(space_file(RELAXATION)).parameters["rollout.relaxation.alpha"].baseline == 0.02
+
+
+def test_a_relaxation_needs_a_size_and_a_step():
+    study = load_study(REPOSITORY / "experiments" / "rollout.toml", [])
+    with pytest.raises(ConfigError, match=r"rollout\.relaxation\.alpha: Field required"):
+        study.configured({"rollout.relaxation.loops": 3})
+    with pytest.raises(ConfigError, match=r"rollout\.relaxation: is for steps, and 'density_gradient' is a field"):
+        load_study(REPOSITORY / "experiments" / "smoke.toml", ["rollout.relaxation.alpha=0.01"])

@@ -9,6 +9,7 @@ from systems import configured, periodic_frame, periodic_scene, problem, window_
 
 from cconv.errors import ConfigError
 from cconv.forces import ReversePoiseuilleForce
+from cconv.models.relaxation import Relaxation
 from cconv.study.declared.configuration import DEFAULTS, TrainingConfig
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
@@ -137,3 +138,10 @@ def test_a_rollout_of_the_model_adds_the_force_that_its_samples_do_not(generator
 def test_no_integrator_adds_a_force_that_is_not_there(generator):
     with pytest.raises(ConfigError, match="there is no external force"):
         falling(generator, None).build_model(of_history(6)._replace(external_force="integrator"), 0)
+
+
+def test_models_have_the_relaxation_of_their_configuration(generator):
+    given, relaxation = falling(generator), Relaxation(alpha=0.02)
+    plain, relaxed = (given.build_model(of_history(6)._replace(relaxation=each), 0) for each in (None, relaxation))
+    assert (plain.config.relaxation, relaxed.config.relaxation) == (None, relaxation)
+    assert given.valid_error(relaxed) != given.valid_error(plain)
