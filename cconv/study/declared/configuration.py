@@ -277,11 +277,11 @@ def _with_predictor(parameters: Mapping[str, Value], defaults: Configuration) ->
 
 
 def _relaxation(parameters: Mapping[str, Value], defaults: Configuration) -> Relaxation | None:
-    """The relaxation as drawn or as in the study; one of size 0 is none."""
+    """The relaxation as drawn or as in the study; one of size 0, or without a size, is none."""
     drawn = below(RELAXATION, parameters)
     if not drawn:
         return defaults.relaxation
-    known = {} if defaults.relaxation is None else defaults.relaxation.model_dump()
+    known = {"alpha": 0.0} if defaults.relaxation is None else defaults.relaxation.model_dump()
     relaxation = _possible(Relaxation, RELAXATION, known | drawn)
     return relaxation if relaxation.alpha > 0 else None
 

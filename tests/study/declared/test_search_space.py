@@ -410,7 +410,10 @@ def test_the_relaxation_of_rollouts_is_a_hyperparameter_of_steps(space_file):
 
 def test_a_relaxation_needs_a_size_and_a_step():
     study = load_study(REPOSITORY / "experiments" / "rollout.toml", [])
-    with pytest.raises(ConfigError, match=r"rollout\.relaxation\.alpha: Field required"):
-        study.configured({"rollout.relaxation.loops": 3})
+    assert study.configured({"rollout.relaxation.loops": 3}).relaxation is None
+    with pytest.raises(ConfigError, match=r"rollout\.relaxation\.alpha: "):
+        study.configured({"rollout.relaxation.alpha": -1.0})
+    with pytest.raises(ConfigError, match="rollout.relaxation.alpha"):
+        load_study(REPOSITORY / "experiments" / "rollout.toml", ["rollout.relaxation.loops=3"])
     with pytest.raises(ConfigError, match=r"rollout\.relaxation: is for steps, and 'density_gradient' is a field"):
         load_study(REPOSITORY / "experiments" / "smoke.toml", ["rollout.relaxation.alpha=0.01"])
