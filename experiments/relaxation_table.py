@@ -3,23 +3,23 @@
     python experiments/relaxation_table.py --data FOLDER --relax 0.02,0.3,3 NAME=CHECKPOINT [NAME=CHECKPOINT ...]
 
 Rows are the checkpoints without and with the relaxation (`_p`). Numbers are means over the trajectories of the split,
-with a 95 % interval by Student's t where there are three or more. Checkpoints of one name are trainings of one model
-with several seeds. Sinkhorn divergence, densities, energies and Chamfer distance are those of the last frame, energies
-and Dirichlet energies as a multiple of the stored ones. Where a rollout diverges, only the number of these is told.
+with the 95 % interval of `cconv.evaluation.statistics.mean_interval`: over trajectories and seeds, or over the seeds on
+a single trajectory. Checkpoints of one name are trainings of one model with several seeds. Sinkhorn divergence,
+densities, energies and Chamfer distance are those of the last frame, energies and Dirichlet energies as a multiple of
+the stored ones. Where a rollout diverges, only the number of these is told.
 """
 
 import argparse
-import math
 from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import t as student
 
 from cconv import load_model, open_dataset
 from cconv.data.stored_frames import StoredFrames
 from cconv.evaluation.recorded_rollout import RecordedRollout, asked_rollout, record_rollout
+from cconv.evaluation.statistics import mean_interval
 from cconv.models.model import Model
 from cconv.rollout.correctors import SPHRelaxation
 from cconv.tasks.task import as_step
@@ -44,14 +44,13 @@ def measures(found: RecordedRollout) -> list[float]:
 
 
 def in_words(values: np.ndarray) -> str:
-    """Mean of a table (seeds, trajectories), with the interval over its longer side's means where these are three."""
+    """Mean of a table (seeds, trajectories), with its interval; that of seeds alone where there is one trajectory."""
     if not values.size:
         return "–"
-    means = values.mean(axis=0) if values.shape[1] >= values.shape[0] else values.mean(axis=1)
-    if len(means) < 3:
+    interval = mean_interval(values if values.shape[1] > 1 else values.T)
+    if interval is None:
         return f"{values.mean():.2g}"
-    width = student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means))
-    return f"{values.mean():.2g} ({max(0.0, values.mean() - width):.2g} to {values.mean() + width:.2g})"
+    return f"{values.mean():.2g} ({max(0.0, interval[0]):.2g} to {interval[1]:.2g})"
 
 
 def rolled(model: Model, stored: StoredFrames, scene, relaxation: SPHRelaxation | None, frames: int | None):
