@@ -21,6 +21,7 @@ from cconv.study.declared.configuration import (
     TrainingConfig,
     Updates,
     check_asked,
+    check_least_squares,
     configure,
 )
 from cconv.study.declared.stage import Ridge, Stage, check_names, check_order, included
@@ -90,9 +91,12 @@ class PredictorConfig(StrictModel):
 
 
 class FinalistsConfig(StrictModel):
-    """Protocol of every retraining and test. `updates` None means the search's budget."""
+    """Protocol of every retraining and test. `updates` None means the search's budget.
 
-    seeds: Whole = Field(5, ge=2, le=1000)
+    With one seed nothing is known of how far trainings differ, and trained models have no intervals.
+    """
+
+    seeds: Whole = Field(5, ge=1, le=1000)
     updates: Updates | None = None
     frames_per_block: Whole = Field(3, ge=1, le=10**6)
 
@@ -214,6 +218,21 @@ class StudyConfig(StrictModel):
             except ConfigError as error:
                 raise ValueError(f"finalist `{finalist}`: {error}") from error
         return self
+
+    def check_stages(self) -> None:
+        """Check that the stages can run with this training; a file for a single training need not ask that.
+
+        Raises:
+            ConfigError: With the stage and the setting.
+        """
+        for name, stage in self.stages.items():
+            if stage.fits_squares:
+                check_least_squares(self.training.loss, f"stage `{name}`")
+            if stage.counts_updates and self.training.cpu_seconds is not None:
+                raise ConfigError(
+                    f"stage `{name}` compares trainings after equal numbers of updates, and `training.cpu_seconds` "
+                    "ends them after equal time; remove one of them, or name other stages."
+                )
 
     @property
     def configuration(self) -> Configuration:
