@@ -58,7 +58,7 @@ class Silent:
     def on_data(self, findings):
         pass
 
-    def on_stage(self, stage, num_trials, max_updates):
+    def on_stage(self, stage, num_trials, training):
         pass
 
     def on_trial_start(self, trial, parameters):

@@ -17,6 +17,7 @@ from rich.text import Text
 from cconv.cli.console import PlainConsole, plain_column
 from cconv.cli.live import StudyDisplay, TrainingBar
 from cconv.evaluation.objectives import OBJECTIVES, ErrorTable, Objective
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.run_folder import FORMAT, RunFolder
 from cconv.tasks.task import FieldTask
 
@@ -95,7 +96,7 @@ def test_the_live_table_shows_foreign_strings_as_they_are(console):
     shown, printed = console
     with StudyDisplay(shown) as display:
         display.on_data([HOSTILE])
-        display.on_stage(HOSTILE, 2, 10)
+        display.on_stage(HOSTILE, 2, TrainingConfig(updates=10))
         display.on_trial_start(HOSTILE, {HOSTILE: HOSTILE})
         display.on_trial_end(HOSTILE, "failed", HOSTILE)
         shown.print(display._draw())
@@ -105,7 +106,7 @@ def test_the_live_table_shows_foreign_strings_as_they_are(console):
 
 def test_progress_shows_foreign_strings_as_they_are(console):
     shown, printed = console
-    with TrainingBar(shown, "[/red]", 3):
+    with TrainingBar(shown, "[/red]"):
         pass
     assert "[/red]" in printed()
     assert plain_column("{task.description}").markup is False

@@ -69,6 +69,13 @@ def test_fit_needs_a_single_layer(cconv, flow_folder, tmp_path):
     assert not (tmp_path / "one").exists()
 
 
+def test_a_loss_that_is_no_sum_of_squares_is_refused_before_the_data_are_read(cconv, tmp_path):
+    loss = ("--set", "training.loss=neighbor_weighted")
+    outcome = cconv("fit", SMOKE, "--data", tmp_path / "none", "--out", tmp_path / "one", *loss)
+    assert_one_clear_line(outcome, "`training.loss` must be 'mse' or 'balanced_mse' for", "got 'neighbor_weighted'")
+    assert not (tmp_path / "one").exists()
+
+
 def test_train_leaves_a_checkpoint_that_evaluates(cconv, flow_folder, tmp_path):
     status, out, _ = cconv("train", SMOKE, "--data", flow_folder, "--out", tmp_path / "one")
     assert status == 0

@@ -71,5 +71,5 @@ def end_of(folder, seed) -> tuple[str, str] | None:
 
 def trained_in(pool, study, folder, seeds, judge=None) -> dict:
     """Train models of some initial weights in a pool; gives how each ended and why."""
-    pool.run(TrialQueue(jobs_in(folder, seeds), FULL, judge or NothingStops(), []), "random", study.training)
+    pool.run(TrialQueue(jobs_in(folder, seeds), study.training, judge or NothingStops(), []), "random", study.training)
     return {seed: end_of(folder, seed) for seed in seeds}

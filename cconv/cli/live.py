@@ -13,6 +13,7 @@ from rich.table import Table
 from cconv.cli.console import plain_column, print_findings
 
 if TYPE_CHECKING:
+    from cconv.study.declared.configuration import TrainingConfig
     from cconv.training.loop import TrainingState
 
 ROWS = 12
@@ -40,7 +41,6 @@ class StudyDisplay:
     _rows: dict[str, _Row] = field(default_factory=dict)
     _stage: str = ""
     _num_trials: int = 0
-    _max_updates: int = 1
     _began: float = 0.0
     _live: Live | None = None
 
@@ -58,11 +58,11 @@ class StudyDisplay:
         """Print a line for each implausibility of the data."""
         print_findings(findings, self.console)
 
-    def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
+    def on_stage(self, stage: str, num_trials: int, training: "TrainingConfig") -> None:
         """Begin a stage with an empty table."""
-        self._stage, self._num_trials, self._max_updates = stage, num_trials, max_updates
+        self._stage, self._num_trials = stage, num_trials
         self._rows, self._began = {}, time.monotonic()
-        self.console.print(f"{stage}: {num_trials} trainings of up to {max_updates} updates", style="bold")
+        self.console.print(f"{stage}: {num_trials} trainings of up to {training.budget}", style="bold")
 
     def on_trial_start(self, trial: str, parameters: Mapping) -> None:
         """Add a row."""
@@ -112,8 +112,7 @@ class StudyDisplay:
         best = sorted(ended, key=lambda item: (-item[1].updates, item[1].error or float("inf")))
         for name, row in [*running, *best[: ROWS - len(running)]]:
             settings = " ".join(f"{key}={_short(value)}" for key, value in row.parameters.items())
-            updates = f"{row.updates}/{self._max_updates}"
-            table.add_row(name, row.outcome, updates, f"{row.rate:.1f}", _number(row.error), settings)
+            table.add_row(name, row.outcome, f"{row.updates}", f"{row.rate:.1f}", _number(row.error), settings)
         return table
 
 
@@ -123,20 +122,19 @@ class TrainingBar:
     Args:
         console: Where to draw.
         name: Name of the training.
-        updates: Its budget.
     """
 
-    def __init__(self, console: Console, name: str, updates: int):
-        self._console, self._updates = console, updates
+    def __init__(self, console: Console, name: str):
+        self._console = console
         self._best: float | None = None
         self._progress = Progress(
             plain_column("{task.description}"),
             BarColumn(),
-            plain_column("{task.completed}/{task.total} updates  {task.fields[figures]}"),
+            plain_column("{task.fields[figures]}"),
             console=console,
             disable=not console.is_terminal,
         )
-        self._task = self._progress.add_task(name, total=updates, figures="")
+        self._task = self._progress.add_task(name, total=1.0, figures="")
 
     def __enter__(self) -> "TrainingBar":
         self._progress.start()
@@ -151,12 +149,12 @@ class TrainingBar:
         if valid is not None:
             self._best = valid if self._best is None else min(self._best, valid)
         rate = state.updates / state.seconds
-        left = (self._updates - state.updates) / rate
-        figures = f"{rate:.1f}/s  loss {state.train_loss:.3g}  best {_number(self._best)}  {left:.0f} s left"
-        self._progress.update(self._task, completed=state.updates, figures=figures)
+        left = max(0.0, state.seconds * (1 / state.share - 1))
+        errors = f"loss {state.train_loss:.3g}  best {_number(self._best)}"
+        figures = f"{state.updates} updates  {rate:.1f}/s  {errors}  {left:.0f} s left"
+        self._progress.update(self._task, completed=state.share, figures=figures)
         if valid is not None and not self._console.is_terminal:
-            line = f"{state.updates}/{self._updates} updates, validation error {valid:.4g}, {figures}"
-            self._console.print(line, soft_wrap=True)
+            self._console.print(f"validation error {valid:.4g}, {figures}", soft_wrap=True)
 
 
 def _number(value: float | None) -> str:

@@ -18,9 +18,12 @@ from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import Horizon, check_setting
 
 if TYPE_CHECKING:
+    from cconv.data.dataset import Dataset
     from cconv.data.trajectory import Scene
     from cconv.evaluation.objectives import Objective
     from cconv.models.model import Model, ModelConfig
+    from cconv.study.declared.study_file import StudyConfig
+    from cconv.study.running.problem import Problem
 
 TRAINED_AT = (
     ("particle_spacing", "particle spacing", 1e-6),
@@ -43,12 +46,13 @@ def train(
     from cconv.study.running.problem import provenance
     from cconv.study.running.trial import Trial, run_trial
 
-    config, problem, dataset = _study_and_problem(study, data, settings, out)
+    config = _declared_study(study, data, settings, out)
+    problem, dataset = _loaded_problem(config)
     folder = TrialFolder(out)
     seeds = {"init_seed": config.seeds.init, "data_seed": config.seeds.data}
     trial = Trial(stage="train", parameters={}, provenance=provenance(config, dataset), **seeds)
     try:
-        with TrainingBar(errors, config.name, config.training.updates) as bar:
+        with TrainingBar(errors, config.name) as bar:
             entries = list(run_trial(problem, trial, config.configuration, folder, on_update=bar.on_update))
     except CConvError:
         shutil.rmtree(out, ignore_errors=True)
@@ -86,11 +90,14 @@ def fit(
     (`cconv evaluate DIR`).
     """
     from cconv.models.checkpoint import save_model
+    from cconv.study.declared.configuration import check_least_squares
     from cconv.study.declared.stage import Ridge
     from cconv.study.running.problem import provenance
 
     check_setting(Ridge, ridge, "--ridge")
-    config, problem, dataset = _study_and_problem(study, data, settings, out)
+    config = _declared_study(study, data, settings, out)
+    check_least_squares(config.training.loss, "a single layer")
+    problem, dataset = _loaded_problem(config)
     model = problem.build_model(config.configuration, config.seeds.init)
     places = show_progress(range(len(problem.train_samples)), "fit")
     problem.solve_closed_form(model, config.training, places, ridge, config.seeds.data)
@@ -317,11 +324,9 @@ def report(
         results.print(f"Tables: {len(files)} files in {tables}", soft_wrap=True)
 
 
-def _study_and_problem(study: Path, data: str | None, settings: list[str] | None, out: Path) -> tuple:
-    """Return settings, samples and data of a study whose single model is written to `out`, which must not exist yet."""
-    from cconv.data.plausibility import dataset_findings
-    from cconv.study.running.predictor import with_predictor
-    from cconv.study.running.problem import load_problem, open_study_data, study_task, with_data_path
+def _declared_study(study: Path, data: str | None, settings: list[str] | None, out: Path) -> "StudyConfig":
+    """Return the settings of a study whose single model is written to `out`, which must not exist yet."""
+    from cconv.study.running.problem import with_data_path
     from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
@@ -329,7 +334,16 @@ def _study_and_problem(study: Path, data: str | None, settings: list[str] | None
         config = with_data_path(config, data)
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
+    return config
+
+
+def _loaded_problem(config: "StudyConfig") -> tuple["Problem", "Dataset"]:
+    """Return the samples of a study, with its predictor if it has one, and its data."""
+    from cconv.data.plausibility import dataset_findings
+    from cconv.study.running.predictor import with_predictor
+    from cconv.study.running.problem import load_problem, open_study_data, study_task
+
     dataset = open_study_data(config.data, config.seeds.data)
     print_findings(dataset_findings(dataset, show_progress))
     problem = load_problem(config, dataset, study_task(config, dataset.scene), show_progress)
-    return config, with_predictor(problem, config, progress=show_progress), dataset
+    return with_predictor(problem, config, progress=show_progress), dataset

@@ -87,7 +87,7 @@ def run(
     that no stage has seen. Ctrl-C stops cleanly: records stay readable (`cconv study status`, `cconv report`), and
     `cconv study resume` continues, also after a kill. Watch it live: optuna-dashboard runs/STUDY/optuna.journal
     """
-    from cconv.study.declared.search_space import load_space
+    from cconv.study.declared.search_space import study_space
     from cconv.study.pipeline import begin_study
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.running.problem import open_study_data, with_data_path
@@ -95,9 +95,10 @@ def run(
 
     _check_place(address, serial)
     config = load_study(study, settings or [])
+    config.check_stages()
     if data is not None:
         config = with_data_path(config, data)
-    space = load_space(config.search.space, config)
+    space = study_space(config)
     open_study_data(config.data, config.seeds.data)
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
     begin_study(config, space, folder)
@@ -207,18 +208,19 @@ def status(
 
 @app.command()
 def compare(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders of finished studies, at least two.")
-    ],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders of finished studies.")],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the page to FILE.html.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE if it exists.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
     """Compare what studies recommend: scene by scene the smallest sufficient model, its error, cost and inputs.
 
-    Studies that ask the same of the same data as the first are compared by the ratio of their errors.
+    Studies that ask the same of the same data as the first are compared by the ratio of their errors. Of studies of
+    steps there is a scoreboard, too: every finalist, its errors, times and training, beside what others report.
     """
-    from cconv.report.comparison import answers_table, compared_runs, differences_table, write_comparison
+    from cconv.report.compared_runs import compared_runs
+    from cconv.report.comparison import answers_table, differences_table, write_comparison
+    from cconv.report.scoreboard import scores_table
     from cconv.study.records.run_folder import RunFolder
 
     if out is not None and out.suffix != ".html":
@@ -226,17 +228,19 @@ def compare(
     if out is not None and out.exists() and not overwrite:
         raise ConfigError(f"{out} exists; name another file, or give --overwrite.")
     compared = compared_runs([RunFolder.open(path) for path in runs])
-    answers, differences = answers_table(compared), differences_table(compared)
+    answers, differences, scores = answers_table(compared), differences_table(compared), scores_table(compared)
     if out is not None:
         write_comparison(compared, out)
     if as_json:
-        tables = {"answers": answers, "differences": differences}
+        tables = {"answers": answers, "differences": differences, "scores": scores}
         print_json({name: json.loads(table.to_json(orient="records")) for name, table in tables.items()})
         return
     results.print(_answers_table(answers))
     for row in differences.itertuples():
         interval = row.why_none or f"95 %: {row.ci95_low:.3g} to {row.ci95_high:.3g}"
         results.print(f"error of {row.study} ÷ {row.reference}: {row.ratio:.3g} ({interval})", soft_wrap=True)
+    for data, rows in scores.groupby("data", sort=False):
+        results.print(_scores_table(str(data), rows))
     if out is not None:
         results.print(f"Page: {out}", soft_wrap=True)
 
@@ -261,6 +265,29 @@ def _answers_table(answers: "pd.DataFrame") -> Table:
             "yes" if row.stable else "no",
         )
     return table
+
+
+def _scores_table(data: str, scores: "pd.DataFrame") -> Table:
+    """The networks of a scene, those that others report at the end."""
+    table = Table(title=f"Scoreboard, {data}", title_justify="left", padding=(0, 0))
+    table.add_column("network", overflow="fold", min_width=16)
+    for name in ("parameters", "ms", "MSE5", f"MSE{scores['horizon'].iloc[0]}", "all frames", "updates", "CPU min"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in scores.itertuples():
+        where = "" if row.source == "measured" else f", published ({row.source})"
+        whole = _figure(row.mse) if math.isnan(row.ended) else f"ends at {row.ended:.0f}"
+        figures = (row.ms, row.mse5, row.error)
+        counts = [_count(row.parameters), *map(_figure, figures), whole, _count(row.updates), _figure(row.cpu_minutes)]
+        table.add_row(f"{row.network}{where}", *counts)
+    return table
+
+
+def _figure(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.3g}"
+
+
+def _count(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:,.0f}"
 
 
 def _finalists_table(summary: "Summary") -> Table:

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from cconv.evaluation.metrics import blocks_of_errors, own_variance, per_frame_normalized_mse
-from cconv.evaluation.rollout_errors import constant_rollouts, rollouts_of
+from cconv.evaluation.rollout_errors import RolloutErrors, constant_rollouts, rollouts_of
 from cconv.models.errors import frame_errors, mean_predictor_error, normalized_mse
 from cconv.models.model import Model
 from cconv.tasks.samples import Sample
@@ -151,6 +151,7 @@ class RolloutMSE(Objective):
     measures = {
         "first-frame MSE": "The first-frame MSE is that of the first frame of each rollout, the error of a single "
         "step, which says little about stability.",
+        "MSE5": "MSE5 is that of the first five frames, as LagrangeBench reports it beside MSE20.",
         "diverged rollouts": "Diverged rollouts are the share of rollouts that did not reach their last frame.",
     }
     mean_predictor = "All particles then get the same acceleration, so that they go on nearly at a constant velocity."
@@ -170,6 +171,7 @@ class RolloutMSE(Objective):
             units=np.array([errors[group].mean() for group in groups]) if len(groups) > 1 else errors,
             measures={
                 "first-frame MSE": float(np.mean([each.errors[0] for each in rolled])),
+                "MSE5": _mean_of_first(5, rolled),
                 "diverged rollouts": float(np.mean([each.diverged is not None for each in rolled])),
             },
         )
@@ -187,6 +189,13 @@ class RolloutMSE(Objective):
         answers = torch.cat([(each.target * each.target_unit).double() for each in train_samples])
         mean = answers.mean(dim=0)
         return float(np.mean([each.error for each in constant_rollouts(mean, samples)]))
+
+
+def _mean_of_first(count: int, rolled: Sequence[RolloutErrors]) -> float | None:
+    """Mean error of the first frames of rollouts; None if they are shorter."""
+    if any(len(each.errors) < count for each in rolled):
+        return None
+    return float(np.mean([each.errors[:count].mean() for each in rolled]))
 
 
 OBJECTIVES: dict[str, Objective] = {objective.name: objective() for objective in (NormalizedMSE, RolloutMSE)}

@@ -1,8 +1,7 @@
-"""Several studies on one page: what each recommends, the speed-accuracy fronts, and how far the errors differ."""
+"""Studies on one page: what each recommends, fronts, how far errors differ, and networks of steps side by side."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,79 +9,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import ttest_ind
 
-from cconv.errors import ConfigError
 from cconv.evaluation.statistics import FEWEST
-from cconv.files import read_json, write_text
+from cconv.files import write_text
+from cconv.report.compared_runs import ComparedRun
 from cconv.report.page import templates
 from cconv.report.plots import new_figure
+from cconv.report.published import BUDGET
+from cconv.report.scoreboard import matrix, scores_table
 from cconv.report.tables import speed_accuracy_table
-from cconv.study.records.forms import Count
-from cconv.study.records.run_folder import RunFolder
-from cconv.study.records.summary import FinalistEntry, Summary
-from cconv.validation import Name, OpenModel, validated
+from cconv.study.records.summary import Summary
 
 NEEDED = 1.1  # ratio of errors from which on an input that was left out counts as needed
-
-
-class _Inputs(OpenModel):
-    """What a checkpoint's `config.json` says of the inputs of a model; nothing if the checkpoint is gone."""
-
-    history: Count | None = None
-    features: tuple[Name, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedRun:
-    """A finished study among those that are compared.
-
-    Attributes:
-        label: Its name, with its folder where two studies have one name.
-        summary: Its results.
-        inputs: Inputs of the recommended model.
-    """
-
-    label: str
-    summary: Summary
-    inputs: _Inputs
-
-    @property
-    def chosen(self) -> FinalistEntry:
-        """The recommended finalist."""
-        return self.summary.chosen
-
-
-def compared_runs(runs: Sequence[RunFolder]) -> list[ComparedRun]:
-    """Read the results of finished studies.
-
-    Raises:
-        ConfigError: If there are fewer than two, one is given twice, or one has not finished.
-    """
-    if len(runs) < 2:
-        raise ConfigError(f"a comparison needs at least two run folders, got {len(runs)}.")
-    paths = [run.path.resolve() for run in runs]
-    twice = [path for path in paths if paths.count(path) > 1]
-    if twice:
-        raise ConfigError(f"{twice[0]} is given twice; name each run folder once.")
-    unfinished = [run.path for run in runs if not run.has_summary]
-    if unfinished:
-        raise ConfigError(
-            f"{unfinished[0]}: the study has not finished, so it has no answer to compare; go on with it by "
-            f"`cconv study resume {unfinished[0]}`."
-        )
-    summaries = [run.summary() for run in runs]
-    names = [summary.study for summary in summaries]
-    return [
-        ComparedRun(
-            label=summary.study if names.count(summary.study) == 1 else f"{summary.study} ({run.path})",
-            summary=summary,
-            inputs=_read_inputs(run.path / summary.chosen.checkpoint / "config.json"),
-        )
-        for run, summary in zip(runs, summaries, strict=True)
-    ]
-
-
-def _read_inputs(path: Path) -> _Inputs:
-    return validated(_Inputs, read_json(path, error=ConfigError), path) if path.exists() else _Inputs()
 
 
 def answers_table(runs: Sequence[ComparedRun]) -> pd.DataFrame:
@@ -191,11 +128,14 @@ def fronts_chart(runs: Sequence[ComparedRun]) -> Figure:
 
 def write_comparison(runs: Sequence[ComparedRun], path: Path) -> None:
     """Write the page that shows the tables and the chart; it opens without a network."""
-    page = templates().get_template("comparison.html.j2")
+    page, scores = templates().get_template("comparison.html.j2"), scores_table(runs)
     text = page.render(
         runs=runs,
         answers=answers_table(runs).to_dict("records"),
         differences=differences_table(runs).to_dict("records"),
         chart=fronts_chart(runs),
+        scenes={scene: rows.to_dict("records") for scene, rows in scores.groupby("data", sort=False)},
+        matrix=matrix(scores),
+        published_budget=BUDGET,
     )
     write_text(path, text)

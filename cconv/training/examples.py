@@ -20,7 +20,9 @@ class Examples(Protocol):
     def __len__(self) -> int:
         """Number of samples of an epoch."""
 
-    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+    def draw(
+        self, indices: Sequence[int], update: int, model: Model, steps: int = 1, share: float = 0.0
+    ) -> list[Sample]:
         """Return some of them, as they are seen in an update of a model, in as few graphs as are sensible.
 
         Args:
@@ -28,6 +30,7 @@ class Examples(Protocol):
             update: Number of the update.
             model: The model.
             steps: Steps that are learned at once; as many following frames are known, where they are stored.
+            share: Share of the training's budget that is spent before.
         """
 
 
@@ -44,7 +47,9 @@ class StoredExamples:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+    def draw(
+        self, indices: Sequence[int], update: int, model: Model, steps: int = 1, share: float = 0.0
+    ) -> list[Sample]:
         """Return samples; arguments as of `Examples.draw`."""
         if isinstance(self.samples, WindowSamples):
             return _step_samples([self.samples.window(index) for index in indices], self.samples, model, steps)
@@ -70,18 +75,20 @@ class AugmentedExamples:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def draw(self, indices: Sequence[int], update: int, model: Model, steps: int = 1) -> list[Sample]:
+    def draw(
+        self, indices: Sequence[int], update: int, model: Model, steps: int = 1, share: float = 0.0
+    ) -> list[Sample]:
         """Return samples of windows that were changed for this update; arguments as of `Examples.draw`."""
-        scene, changed = self.samples.scene, [self._changed(index, update) for index in indices]
+        scene, changed = self.samples.scene, [self._changed(index, update, share) for index in indices]
         windows = pushed(model, [window for window, _ in changed], scene, [count for _, count in changed])
         return _step_samples(windows, self.samples, model, steps)
 
-    def _changed(self, index: int, update: int) -> tuple[Window, int]:
+    def _changed(self, index: int, update: int, share: float) -> tuple[Window, int]:
         """A window that was changed for an update, and how many steps it is to be pushed."""
         state = np.random.SeedSequence([self.seed, update, index]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state[0] >> 1))
         window = self.augmentation(self.samples.window(index), self.samples.scene, generator)
-        return window, min(self.pushforward.steps(update, generator), len(window.future) - 1)
+        return window, min(self.pushforward.steps(share, generator), len(window.future) - 1)
 
 
 def _step_samples(windows: Sequence[Window], of: WindowSamples, model: Model, steps: int) -> list[Sample]:

@@ -32,20 +32,25 @@ SCHEDULES = {
 class Optimization:
     """Budget and settings of the optimiser of a training.
 
+    The rate falls, and unrolling begins, with the share of the budget that is spent.
+
     Attributes:
-        updates: Number of gradient updates.
+        updates: Largest number of gradient updates.
+        cpu_seconds: Time after which no update begins: CPU time of this process in updates, without evaluations, so
+            that what else the machine does takes nothing away; None for no such limit.
         evaluate_every: Updates between evaluations; the last update is always evaluated.
         batch_size: Frames of an update.
         learning_rate: Initial learning rate of Adam.
         schedule: "constant", "cosine" or "exponential"; the last two fall to 1 % of the initial rate.
         loss: Name in `LOSSES`.
         unroll: Steps of the model's own rollout that an update differentiates through; 1 for fields.
-        unroll_from: Share of the updates after which there is more than one.
+        unroll_from: Share of the budget after which there is more than one.
         average: Decay of the moving average of the weights that is evaluated; 0 evaluates the weights themselves.
     """
 
     updates: int
     evaluate_every: int
+    cpu_seconds: float | None = None
     batch_size: int = 1
     learning_rate: float = 1e-3
     schedule: str = "cosine"
@@ -54,17 +59,18 @@ class Optimization:
     unroll_from: float = 0.5
     average: float = 0.0
 
-    def rate_at(self, update: int) -> float:
-        """Return the learning rate of an update, counted from 1."""
-        return self.learning_rate * SCHEDULES[self.schedule]((update - 1) / self.updates)
+    def share(self, progress: Progress) -> float:
+        """Return the share of the budget that is spent, of the updates or of the time; from 1 on it is spent."""
+        of_time = 0.0 if self.cpu_seconds is None else progress.cpu_seconds / self.cpu_seconds
+        return max(progress.updates / self.updates, of_time)
 
-    def steps_at(self, update: int) -> int:
-        """Return the number of steps in an update, counted from 1."""
-        return self.unroll if update > self.unroll_from * self.updates else 1
+    def rate_at(self, share: float) -> float:
+        """Return the learning rate of an update, before which a share of the budget is spent."""
+        return self.learning_rate * SCHEDULES[self.schedule](share)
 
-    def is_evaluated(self, update: int) -> bool:
-        """Tell whether an evaluation follows an update."""
-        return update % self.evaluate_every == 0 or update == self.updates
+    def steps_at(self, share: float) -> int:
+        """Return the number of steps in an update, before which a share of the budget is spent."""
+        return self.unroll if share >= self.unroll_from else 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +83,8 @@ class TrainingState:
         learning_rate: Learning rate of this update.
         valid_error: Validation error if an evaluation followed this update, else None.
         seconds: Time since training began, evaluations included.
+        cpu_seconds: CPU time of the updates, without evaluations.
+        share: Share of the budget that is spent.
         diverged: Whether a loss or validation error was not finite, which ends the training.
         model: The model as it is evaluated: with the weights of this update, or with their average.
     """
@@ -86,6 +94,8 @@ class TrainingState:
     learning_rate: float
     valid_error: float | None
     seconds: float
+    cpu_seconds: float
+    share: float
     diverged: bool
     model: Model
 
@@ -123,27 +133,31 @@ def train(
     judged = progress.average or model
     start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
-    order = batches(len(examples), optimization.batch_size, data_seed)
-    order = islice(order, progress.updates, optimization.updates)
-    for update, indices in enumerate(order, start=progress.updates + 1):
-        rate = optimization.rate_at(update)
+    order = islice(batches(len(examples), optimization.batch_size, data_seed), progress.updates, None)
+    while (share := optimization.share(progress)) < 1:
+        began, update = time.process_time(), progress.updates + 1
+        rate = optimization.rate_at(share)
         progress.optimizer.param_groups[0]["lr"] = rate
-        steps = optimization.steps_at(update)
-        batch = examples.draw(indices, update, model, steps)
+        steps = optimization.steps_at(share)
+        batch = examples.draw(next(order), update, model, steps, share)
         loss = _update(model, batch, progress.optimizer, geometry, LOSSES[optimization.loss], steps)
         if progress.average is not None:
             update_average(progress.average, model, optimization.average, update)
+        progress.updates, progress.cpu_seconds = update, progress.cpu_seconds + time.process_time() - began
+        share = optimization.share(progress)
         valid = None
-        if math.isfinite(loss) and optimization.is_evaluated(update):
+        if math.isfinite(loss) and (update % optimization.evaluate_every == 0 or share >= 1):
             valid = valid_error(judged, geometry)
         diverged = not math.isfinite(loss) or (valid is not None and not math.isfinite(valid))
-        progress.updates, progress.seconds = update, time.perf_counter() - start
+        progress.seconds = time.perf_counter() - start
         yield TrainingState(
             updates=update,
             train_loss=loss,
             learning_rate=rate,
             valid_error=valid,
             seconds=progress.seconds,
+            cpu_seconds=progress.cpu_seconds,
+            share=share,
             diverged=diverged,
             model=judged,
         )

@@ -20,6 +20,7 @@ from cconv.validation import Real, StrictModel, Whole
 class _Counts(StrictModel):
     updates: Whole = Field(ge=0)
     seconds: Real = Field(ge=0)
+    cpu_seconds: Real = Field(0.0, ge=0)  # earlier versions did not count it
 
 
 @dataclass
@@ -30,12 +31,14 @@ class Progress:
         optimizer: Adam over the model's parameters.
         updates: Gradient updates done.
         seconds: Time spent on them, evaluations included.
+        cpu_seconds: CPU time of this process spent on them, evaluations not included.
         average: The model with averages of its weights; None without them.
     """
 
     optimizer: torch.optim.Adam
     updates: int = 0
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     average: Model | None = None
 
 
@@ -46,7 +49,7 @@ def begin(model: Model) -> Progress:
 
 def save_progress(path: Path, model: Model, progress: Progress) -> None:
     """Write weights, their averages, Adam's moments and counts to one safetensors file, atomically."""
-    counts = {"updates": progress.updates, "seconds": progress.seconds}
+    counts = {name: getattr(progress, name) for name in _Counts.model_fields}
     tensors = {f"weights.{name}": value for name, value in model.state_dict().items()}
     for name, parameter in model.named_parameters():
         moments = progress.optimizer.state.get(parameter, {})
@@ -81,7 +84,7 @@ def load_progress(path: Path, model: Model) -> Progress:
     except (SafetensorError, OSError, RuntimeError, KeyError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{path}: no progress of this training ({reason}); delete it to begin again.") from error
-    progress.updates, progress.seconds = counts.updates, counts.seconds
+    progress.updates, progress.seconds, progress.cpu_seconds = counts.updates, counts.seconds, counts.cpu_seconds
     return progress
 
 

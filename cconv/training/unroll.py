@@ -24,15 +24,16 @@ class Pushforward:
 
     Attributes:
         most: Largest number of steps; each number from 0 to it is as likely.
-        begins: First update in which there are any.
+        begins: Share of the budget after which there are any.
     """
 
     most: int
-    begins: int
+    begins: float
 
-    def steps(self, update: int, generator: torch.Generator) -> int:
-        """Draw the number of steps in an update."""
-        return int(torch.randint(self.most + 1, (), generator=generator)) if update >= self.begins else 0
+    def steps(self, share: float, generator: torch.Generator) -> int:
+        """Draw the number of steps in an update, before which a share of the budget is spent; none before the first."""
+        begun = share > 0 and share >= self.begins
+        return int(torch.randint(self.most + 1, (), generator=generator)) if begun else 0
 
 
 @torch.no_grad()

@@ -40,7 +40,7 @@ class Ends:
     def __init__(self):
         self.times: list[float] = []
 
-    def on_stage(self, stage, num_trials, max_updates): ...
+    def on_stage(self, stage, num_trials, training): ...
 
     def on_trial_start(self, trial, parameters): ...
 
@@ -68,7 +68,7 @@ def seconds_between_ends(study: StudyConfig, problem: Problem, folder: Path, tri
     """Mean time from the end of a trial to that of the next, without the start of the processes."""
     ends = Ends()
     with ray_pool(study, problem, folder / "ray") as pool:
-        queue = TrialQueue(jobs(folder / "trials", trials), study.training.updates, NothingStops(), [ends])
+        queue = TrialQueue(jobs(folder / "trials", trials), study.training, NothingStops(), [ends])
         pool.run(queue, "overhead", study.training)
     return (ends.times[-1] - ends.times[0]) / (trials - 1)
 

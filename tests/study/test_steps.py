@@ -32,7 +32,7 @@ def test_models_are_compared_by_rollouts_and_no_analytic_field(run):
     assert summary.explained == ()
     assert set(summary.checks) == set(TASKS["acceleration"].checks)
     for entry in summary.finalists:
-        assert set(entry.test.measures) == {"first-frame MSE", "diverged rollouts"}
+        assert set(entry.test.measures) == {"first-frame MSE", "MSE5", "diverged rollouts"}
         assert 0 < entry.test.error < 0.25
         assert entry.stability.counts.plain_frames == 1 + 6  # from the start of the trajectory, and from others
 

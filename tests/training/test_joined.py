@@ -204,8 +204,9 @@ def test_examples_in_one_graph_are_those_that_are_drawn_one_by_one(generator):
     model = model_of(configured(**NETWORKS["radial"]), SCENE, "acceleration", list(samples), generator)
     examples = AugmentedExamples(samples, RandomWalkNoise(0.02), Pushforward(3, 0), seed=0)
     for update in range(1, 5):
-        drawn = examples.draw([2, 0, 1], update, model, 1)
-        alone = {sample.origins[0]: sample for index in range(3) for sample in examples.draw([index], update, model, 1)}
+        drawn = examples.draw([2, 0, 1], update, model, share=1.0)
+        one_by_one = [sample for index in range(3) for sample in examples.draw([index], update, model, share=1.0)]
+        alone = {sample.origins[0]: sample for sample in one_by_one}
         assert sum(len(sample.origins) for sample in drawn) == 3
         for sample in drawn:
             for origin, inputs, target in zip(

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -35,6 +36,21 @@ def test_evaluations_come_when_due_and_at_the_end(generator):
     _, states = run(problem(generator), updates=7, evaluate_every=3)
     assert [state.updates for state in states] == list(range(1, 8))
     assert [state.updates for state in states if state.valid_error is not None] == [3, 6, 7]
+
+
+def test_evaluations_take_nothing_of_the_time_and_the_last_update_is_evaluated(generator, monkeypatch):
+    """Every look at the clock of the process takes a second: one an update, if no evaluation is counted."""
+    monkeypatch.setattr("cconv.training.loop.time.process_time", itertools.count().__next__)
+    _, states = run(problem(generator), updates=100, evaluate_every=2, cpu_seconds=4.5)
+    assert [state.cpu_seconds for state in states] == [1, 2, 3, 4, 5]
+    assert [state.updates for state in states if state.valid_error is not None] == [2, 4, 5]
+    assert [state.share for state in states[:2]] == [1 / 4.5, 2 / 4.5]
+
+
+def test_whichever_is_spent_first_ends_a_training(generator, monkeypatch):
+    monkeypatch.setattr("cconv.training.loop.time.process_time", itertools.count().__next__)
+    _, states = run(problem(generator), updates=3, cpu_seconds=1000.0)
+    assert [state.updates for state in states] == [1, 2, 3]
 
 
 def test_the_same_seeds_give_the_same_losses(generator):

@@ -1,6 +1,7 @@
 """A training that was left goes on as if it had not been."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -62,6 +63,27 @@ def test_a_restored_training_counts_its_seconds_from_where_it_was(generator, mon
     progress.seconds = 100
     states = train(model, StoredExamples(given.train_samples), given.valid_error, ASKED, progress=progress)
     assert [next(states).seconds for _ in range(3)] == [101, 102, 103]
+
+
+def clocked(monkeypatch):
+    """Every look at the clock of the process takes a second, so that each update does."""
+    monkeypatch.setattr("cconv.training.loop.time.process_time", itertools.count().__next__)
+
+
+def test_a_restored_training_spends_what_is_left_of_its_time(generator, monkeypatch, tmp_path):
+    clocked(monkeypatch)
+    given, asked = problem(generator), replace(ASKED, updates=1000, cpu_seconds=7.0)
+    model = given.build_model(NETWORKS[0], 0)
+    progress = begin(model)
+    states = train(model, StoredExamples(given.train_samples), given.valid_error, asked, progress=progress)
+    rates = [next(states).learning_rate for _ in range(4)]
+    save_progress(tmp_path / "progress", model, progress)
+    restored = load_progress(tmp_path / "progress", model)
+    rest = list(train(model, StoredExamples(given.train_samples), given.valid_error, asked, progress=restored))
+    assert [(state.updates, state.cpu_seconds) for state in rest] == [(5, 5), (6, 6), (7, 7)]
+    rates += [state.learning_rate for state in rest]
+    assert rates == [asked.rate_at(spent / 7) for spent in range(7)]
+    assert list(train(model, StoredExamples(given.train_samples), given.valid_error, asked, progress=restored)) == []
 
 
 def test_a_damaged_file_is_named(generator, tmp_path):

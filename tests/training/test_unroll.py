@@ -26,9 +26,10 @@ def model(samples, generator):
 
 
 def test_there_are_no_steps_before_it_begins_and_all_numbers_after(generator):
-    pushforward = Pushforward(most=3, begins=10)
-    assert {pushforward.steps(9, generator) for _ in range(20)} == {0}
-    assert {pushforward.steps(10, generator) for _ in range(60)} == {0, 1, 2, 3}
+    pushforward = Pushforward(most=3, begins=0.5)
+    assert {pushforward.steps(0.49, generator) for _ in range(20)} == {0}
+    assert {pushforward.steps(0.5, generator) for _ in range(60)} == {0, 1, 2, 3}
+    assert {Pushforward(most=3, begins=0.0).steps(0.0, generator) for _ in range(20)} == {0}
 
 
 def test_the_window_is_that_of_the_models_rollout_and_the_target_leads_back(samples, model):
@@ -63,7 +64,7 @@ def test_a_relaxed_model_learns_from_where_its_relaxed_rollout_leads(samples, mo
 
 def test_examples_are_never_pushed_beyond_what_is_stored(samples, model):
     examples = AugmentedExamples(samples, RandomWalkNoise(0.0), Pushforward(20, 0), seed=0)
-    frames = {sample.frame for update in range(1, 40) for sample in examples.draw([0], update, model)}
+    frames = {sample.frame for update in range(1, 40) for sample in examples.draw([0], update, model, share=1.0)}
     assert frames == {5, 6, 7, 8}  # at least one frame of future is left to lead to
 
 

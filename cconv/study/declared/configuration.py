@@ -1,7 +1,7 @@
 """What a trial can vary: features that the network is given, settings of the network and of its training."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -105,18 +105,22 @@ class TaskConfig(StrictModel):
 
 
 class TrainingConfig(StrictModel):
-    """Budget and optimiser of one training. Budgets count gradient updates; trials at once share the cache.
+    """Budget and optimiser of one training; trials at once share the cache.
 
+    The budget is `updates`, and with `cpu_seconds` also so much CPU time of the training's process in updates,
+    evaluations not counted: whichever is spent first. With it networks of different cost are compared at equal time,
+    and wall time would tell more of the other programs on the machine than of the network. Shares are of that budget.
     `loss` says how much each frame counts, or with "neighbor_weighted" each particle. `noise`, for step tasks, is the
     standard deviation of the random walk that is added to the velocities of a window, in particle spacings per frame.
     `pushforward` is the largest number of steps that the model's own rollout goes on before the step that it learns
-    from, once a share `pushforward_from` of the updates is done. `unroll` is the number of steps of that rollout that
-    it then learns from at once, with gradients through all of them, once a share `unroll_from` of the updates is done.
+    from, once a share `pushforward_from` of the budget is spent. `unroll` is the number of steps of that rollout that
+    it then learns from at once, with gradients through all of them, once a share `unroll_from` of it is spent.
     `average` is the decay of a moving average of the weights, which is evaluated and kept in their place; 0 keeps the
     weights themselves.
     """
 
     updates: Updates = 600
+    cpu_seconds: Real | None = Field(None, ge=1e-3, le=1e8)
     evaluate_every: Updates = 50
     batch_size: Whole = Field(1, ge=1, le=10**6)
     learning_rate: Real = Field(1e-3, ge=1e-12, le=1e3)
@@ -129,6 +133,18 @@ class TrainingConfig(StrictModel):
     unroll_from: Real = Field(0.5, ge=0, le=1)
     average: Real = Field(0.0, ge=0, lt=1)
     cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
+
+    @property
+    def budget(self) -> str:
+        """The budget in words."""
+        if self.cpu_seconds is None:
+            return f"{self.updates} updates"
+        return f"{self.cpu_seconds:g} s of CPU time or {self.updates} updates"
+
+    def is_spent(self, entry: Mapping) -> bool:
+        """Tell whether the budget is spent at an evaluation, by its record."""
+        in_time = self.cpu_seconds is None or entry.get("cpu_seconds", 0.0) < self.cpu_seconds
+        return entry["updates"] >= self.updates or not in_time
 
     @property
     def moving(self) -> dict[str, float]:
@@ -221,6 +237,22 @@ def check_asked(configuration: Configuration, task: str) -> None:
         if not issubclass(TASKS[task], StepTask):
             allowed = f"must be {STILL[name]:g} for the field {task!r}"
             raise ConfigError(f"not possible ({TRAINING}.{name}: {allowed}, got {value:g})")
+
+
+def check_least_squares(loss: str, of: str) -> None:
+    """Check that a loss is one that least squares minimises.
+
+    Args:
+        loss: Name of the loss.
+        of: What is to be fitted, for the message.
+
+    Raises:
+        ConfigError: If it is another.
+    """
+    squared = get_args(SquaredLoss)
+    if loss not in squared:
+        names = " or ".join(map(repr, squared))
+        raise ConfigError(f"`{TRAINING}.loss` must be {names} for {of}, which least squares fits; got {loss!r}")
 
 
 def _possible(form: type[Settings], table: str, values: Mapping[str, Value]) -> Settings:

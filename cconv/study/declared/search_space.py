@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-from cconv.errors import ConfigError, shown
+from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.files import read_toml
 from cconv.networks import ARCHITECTURES
 from cconv.networks.counting import CountedCost
@@ -42,6 +42,27 @@ def load_space(path: Path | str, study: StudyConfig | None = None) -> SearchSpac
     space = validated(SearchSpace, read_toml(path), path)
     check_possible(space, path, study)
     return space
+
+
+def study_space(study: StudyConfig) -> SearchSpace:
+    """The search space that a study names, with the study's own baseline.
+
+    Raises:
+        ConfigError: As `load_space`; also if the study gives a hyperparameter that is not in the space, or a value
+            outside its domain.
+    """
+    space, parameters = load_space(study.search.space, study), {}
+    for name, value in study.search.baseline.items():
+        setting = f"`search.baseline.{name}`"
+        if name not in space.parameters:
+            raise ConfigError(
+                f"{setting}: no such parameter in {study.search.space}.{did_you_mean(name, space.parameters)}"
+            )
+        domain = space.parameters[name]
+        parameters[name] = validated(type(domain), domain.model_dump() | {"baseline": value}, setting)
+    own = space.model_copy(update={"parameters": space.parameters | parameters})
+    check_possible(own, "`search.baseline`", study)
+    return own
 
 
 def check_possible(space: SearchSpace, source: Path | str, study: StudyConfig | None = None) -> None:

@@ -31,6 +31,8 @@ class Stage(StrictModel, ABC):
         needs_records: Whether it can do nothing without a stage to read.
         space_kinds: Kinds of stages whose narrowed space it can search.
         only_for_steps: Whether it makes sense for tasks of steps alone.
+        counts_updates: Whether it compares trainings after equal numbers of updates, whatever time they take.
+        fits_squares: Whether it fits models by least squares, with the study's loss.
         is_single: Whether a study has at most one stage of the kind, because the summary has one place for its result.
         reads: Names of the stages whose records it uses; None means every earlier one of a kind that it can use.
         kind: Its kind, by which the study file chooses the class.
@@ -40,6 +42,8 @@ class Stage(StrictModel, ABC):
     needs_records: ClassVar[bool] = False
     space_kinds: ClassVar[tuple[str, ...]] = ()
     only_for_steps: ClassVar[bool] = False
+    counts_updates: ClassVar[bool] = False
+    fits_squares: ClassVar[bool] = False
     is_single: ClassVar[bool] = False
     reads: tuple[Name, ...] | None = None
     kind: str

@@ -22,8 +22,10 @@ from cconv.study.declared.configuration import (
     TrainingConfig,
     Updates,
     check_asked,
+    check_least_squares,
     configure,
 )
+from cconv.study.declared.paths import by_path
 from cconv.study.declared.stage import Ridge, Stage, check_names, check_order, included
 from cconv.tasks import TASKS
 from cconv.tasks.task import StepTask
@@ -58,17 +60,24 @@ class DataConfig(StrictModel):
 class SearchConfig(StrictModel):
     """What random and adaptive searches share: the space, ASHA's rungs, limits of a trial.
 
+    `baseline` gives hyperparameters of the baseline other values than the space does.
     A trial whose validation error exceeds `give_up_above` at an evaluation is stopped. One that has trained for
     `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency` None means as many
     trials at once as cores.
     """
 
     space: PathText
+    baseline: dict[str, Value] = Field({}, max_length=100)
     grace_updates: Updates = 50
     reduction_factor: Whole = Field(3, ge=2, le=1000)
     give_up_above: Real = Field(10.0, ge=1e-12, le=1e9)
     trial_seconds: Real = Field(3600.0, ge=1e-3, le=1e7)
     concurrency: Whole | None = Field(None, ge=1, le=4096)
+
+    @field_validator("baseline", mode="before")
+    @classmethod
+    def _hyperparameters_by_path(cls, baseline: object) -> object:
+        return by_path(baseline) if isinstance(baseline, Mapping) else baseline
 
 
 class PredictorConfig(StrictModel):
@@ -97,9 +106,12 @@ class RolloutConfig(StrictModel):
 
 
 class FinalistsConfig(StrictModel):
-    """Protocol of every retraining and test. `updates` None means the search's budget."""
+    """Protocol of every retraining and test. `updates` None means the search's budget.
 
-    seeds: Whole = Field(5, ge=2, le=1000)
+    With one seed nothing is known of how far trainings differ, and trained models have no intervals.
+    """
+
+    seeds: Whole = Field(5, ge=1, le=1000)
     updates: Updates | None = None
     frames_per_block: Whole = Field(3, ge=1, le=10**6)
 
@@ -222,6 +234,21 @@ class StudyConfig(StrictModel):
             except ConfigError as error:
                 raise ValueError(f"finalist `{finalist}`: {error}") from error
         return self
+
+    def check_stages(self) -> None:
+        """Check that the stages can run with this training; a file for a single training need not ask that.
+
+        Raises:
+            ConfigError: With the stage and the setting.
+        """
+        for name, stage in self.stages.items():
+            if stage.fits_squares:
+                check_least_squares(self.training.loss, f"stage `{name}`")
+            if stage.counts_updates and self.training.cpu_seconds is not None:
+                raise ConfigError(
+                    f"stage `{name}` compares trainings after equal numbers of updates, and `training.cpu_seconds` "
+                    "ends them after equal time; remove one of them, or name other stages."
+                )
 
     @property
     def configuration(self) -> Configuration:

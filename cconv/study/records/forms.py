@@ -22,6 +22,7 @@ class Entry(OpenModel):
     updates: Count
     valid_error: NonNegative | None
     seconds: NonNegative
+    cpu_seconds: NonNegative | None = None
     train_loss: NonNegative | None = None
     learning_rate: Real | None = None
     diverged: Flag = False

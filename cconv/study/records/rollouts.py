@@ -4,6 +4,7 @@ Errors are mean squared errors of positions. Frames are counted from the start o
 """
 
 from collections.abc import Iterable
+from statistics import fmean
 
 from pydantic import Field
 
@@ -39,6 +40,8 @@ class RolledTrajectory(StrictModel):
         stored: Number of frames that are stored after the start.
         mse: Mean squared error in each frame that was reached.
         looked_at: Numbers of the frames that all measures look at.
+        sinkhorn: Sinkhorn divergences from the stored frames at some of these; of the first trajectory and the best
+            training of a finalist alone, as one takes seconds.
         rollout: Measures of the rollout.
         reference: The same of the stored frames.
         beyond: First frame beyond the limit of a check of stability, by the label of its finding.
@@ -50,10 +53,17 @@ class RolledTrajectory(StrictModel):
     stored: Count
     mse: tuple[NonNegative, ...] = Field(min_length=1)
     looked_at: tuple[Count, ...]
+    sinkhorn: tuple[NonNegative, ...] = ()
     rollout: FlowSeries
     reference: FlowSeries
     beyond: dict[str, Count]
     ended: str
+
+    @property
+    def e_kin_error(self) -> float:
+        """Mean squared error of the kinetic energy, LagrangeBench's, over the frames that were looked at."""
+        pairs = zip(self.rollout.e_kin, self.reference.e_kin, strict=True)
+        return fmean((found - stored) ** 2 for found, stored in pairs)
 
 
 class FinalistRollouts(StrictModel):

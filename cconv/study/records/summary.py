@@ -202,7 +202,7 @@ class FinalistEntry(StrictModel):
         in_words: What its network is, e.g. "radial layer, 8 terms"; "" in records of earlier versions.
         config: Its settings.
         num_parameters: Learned parameters.
-        updates: Gradient updates of each training.
+        updates: Gradient updates of a training, mean.
         fall_at_the_end: Relative fall of the error in the last quarter of the updates; None if it was not measured.
         valid: Errors on the validation split.
         test: Errors on the test split.
@@ -210,6 +210,7 @@ class FinalistEntry(StrictModel):
         stability: Checks of stability.
         checkpoint: Folder of the best model, relative to the run folder.
         train_seconds: Duration of a training, mean.
+        train_cpu_seconds: CPU time of its updates, mean; None in records of earlier versions.
     """
 
     id: Id
@@ -224,6 +225,7 @@ class FinalistEntry(StrictModel):
     stability: Stability
     checkpoint: InnerPath
     train_seconds: NonNegative
+    train_cpu_seconds: NonNegative | None = None
 
 
 class AttainmentStep(StrictModel):

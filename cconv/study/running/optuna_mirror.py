@@ -18,6 +18,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from sqlalchemy.exc import SQLAlchemyError
 
 from cconv.errors import ConfigError
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.records.trials import DIVERGED_ERROR, TrialRecord
 from cconv.study.running.sampling import distributions_of
@@ -183,7 +184,7 @@ class OptunaMirror:
     def on_data(self, findings: Sequence[str]) -> None:
         """Do nothing: Optuna has no place for findings about the data."""
 
-    def on_stage(self, stage: str, num_trials: int, max_updates: int) -> None:
+    def on_stage(self, stage: str, num_trials: int, training: TrainingConfig) -> None:
         """Do nothing: all searches share the study."""
 
     def on_trial_start(self, trial: str, parameters: Mapping) -> None:

@@ -123,8 +123,7 @@ class Problem:
         if not isinstance(samples, WindowSamples):
             settings = ", ".join(f"`training.{name}` = {value:g}" for name, value in training.moving.items())
             raise ConfigError(f"{settings}: not possible for the field {self.task.name!r}, which has no windows.")
-        begins = max(1, round(training.pushforward_from * training.updates))  # closed forms are fitted in update 0
-        pushforward = Pushforward(training.pushforward, begins)
+        pushforward = Pushforward(training.pushforward, training.pushforward_from)
         return AugmentedExamples(samples, RandomWalkNoise(training.noise), pushforward, seed)
 
     def solve_closed_form(

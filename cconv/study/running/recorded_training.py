@@ -45,7 +45,7 @@ def train_recorded(
         with Attempt(job.folder, HANGING * limit) as attempt:
             for last in _trial(job, stage, training, study, problem, attempt):
                 yield Report(last)
-        if not last["diverged"] and last["updates"] < training.updates:
+        if not last["diverged"] and not training.is_spent(last):
             outcome, reason = "stopped", f"it trained longer than its limit of {limit:g} seconds"
     except Exception as error:
         outcome, reason = DISK_FULL if is_disk_full(error) else "failed", str(error) or type(error).__name__

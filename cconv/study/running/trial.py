@@ -87,7 +87,7 @@ def run_trial(
                 entry = _entry(state)
                 if (error := entry["valid_error"]) is not None and error < best:
                     best = error
-                    save_model(state.model, folder.checkpoint, card | {"valid_error": best, "updates": state.updates})
+                    save_model(state.model, folder.checkpoint, card | _spent(state) | {"valid_error": best})
                 folder.append(entry)
                 events.append(entry)
                 save_progress(folder.progress, model, progress)
@@ -136,8 +136,14 @@ def _entry(state: TrainingState) -> dict:
         "valid_error": _finite(state.valid_error),
         "learning_rate": state.learning_rate,
         "seconds": state.seconds,
+        "cpu_seconds": state.cpu_seconds,
         "diverged": state.diverged,
     }
+
+
+def _spent(state: TrainingState) -> dict:
+    """What a training had spent when its model was saved."""
+    return {"updates": state.updates, "seconds": state.seconds, "cpu_seconds": state.cpu_seconds}
 
 
 def _finite(value: float | None) -> float | None:

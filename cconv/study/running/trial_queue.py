@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.rungs import RungFile, RungTable
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.observer import Observer
@@ -87,14 +88,14 @@ class TrialQueue:
 
     Args:
         jobs: The trainings in order; the next one is made only when a process is free.
-        full_updates: Full budget; a training that reaches it is completed.
+        training: Settings of the trainings; one that has spent its full budget is completed.
         judge: Rule that decides after every evaluation whether a training continues.
         observers: Observers that are told about the trainings.
     """
 
-    def __init__(self, jobs: Iterable[Job], full_updates: int, judge: Judge, observers: Sequence[Observer]):
+    def __init__(self, jobs: Iterable[Job], training: TrainingConfig, judge: Judge, observers: Sequence[Observer]):
         self._jobs = iter(jobs)
-        self.full_updates = full_updates
+        self._training = training
         self._judge, self._observers = judge, observers
         self._running: dict[str, Job] = {}
 
@@ -127,11 +128,11 @@ class TrialQueue:
         """Return the outcome of a training that ends after an evaluation."""
         if entry["diverged"]:
             return "diverged"
-        return "completed" if entry["updates"] >= self.full_updates else "stopped"
+        return "completed" if self._training.is_spent(entry) else "stopped"
 
     def _goes_on_from(self, folder: TrialFolder, name: str) -> bool:
         for entry in folder.log():
-            if not self.on_result(name, entry) or entry["updates"] >= self.full_updates:
+            if not self.on_result(name, entry) or self._training.is_spent(entry):
                 self.on_end(name, self.outcome_after(entry))
                 return False
         return True

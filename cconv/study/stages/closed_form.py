@@ -29,6 +29,7 @@ from cconv.study.declared.configuration import (
     NETWORK,
     OPTIONAL_FEATURES,
     TRAINING,
+    WITH_PREDICTOR,
     configure,
     feature_path,
 )
@@ -55,6 +56,7 @@ class ClosedFormStage(Stage):
     """
 
     kind: Literal["closed_form"] = "closed_form"
+    fits_squares = True
     count: Whole = Field(3, ge=1, le=1000)
     max_candidates: Whole = Field(200, ge=1, le=10_000)
     screening_frames: Whole = Field(4, ge=1, le=10_000)
@@ -138,6 +140,7 @@ def _applies(settings: type[NetworkSettings]) -> set[str]:
     return {
         *of_network,
         HISTORY,
+        WITH_PREDICTOR,
         EXTERNAL_FORCE,
         *map(feature_path, OPTIONAL_FEATURES),
         f"{TRAINING}.noise",
@@ -264,12 +267,13 @@ def _fit_and_record(
     config = describe(problem, trial, model, untrained) | {"closed_form": True, "ridge": ridge}
     folder.start(config)
     places, valid = samples
-    start = time.perf_counter()
+    start, began = time.perf_counter(), time.process_time()
     try:
         problem.solve_closed_form(model, configuration.training, places, ridge, study.seeds.data)
     except ConfigError as error:
         folder.finish("failed", str(error))
         return
+    fitted = time.process_time() - began
     valid_error = problem.objective.error(model, valid)
     if not math.isfinite(valid_error):
         folder.finish("failed", "its predictions are not finite")
@@ -280,6 +284,7 @@ def _fit_and_record(
         "valid_error": valid_error,
         "learning_rate": None,
         "seconds": time.perf_counter() - start,
+        "cpu_seconds": fitted,
         "diverged": False,
     }
     folder.append(entry)

@@ -28,6 +28,7 @@ class ConvergeStage(Stage):
 
     kind: Literal["converge"] = "converge"
     is_single = True
+    counts_updates = True
     uses = ("finalists",)
     needs_records = True
     budgets: tuple[Annotated[Whole, Field(ge=1, le=10_000_000)], ...] = Field(min_length=1, max_length=20)

@@ -15,8 +15,9 @@ from pydantic import Field, field_validator
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.objectives import Objective
-from cconv.evaluation.statistics import crossed_interval, why_no_interval
+from cconv.evaluation.statistics import FEWEST, crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
+from cconv.models.model import Model
 from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.paths import by_path
 from cconv.study.declared.stage import BASELINE, Stage
@@ -78,12 +79,12 @@ class Retrained:
 class FinalistsStage(Stage):
     """Retrain the `count` best configurations and the baseline with fresh seeds; fit the best closed forms.
 
-    `include` holds further configurations, e.g. a published one, by the id that they get.
+    `include` holds further configurations, e.g. a published one, by the id that they get. Without a search before it,
+    these and the baseline are all finalists.
     """
 
     kind: Literal["finalists"] = "finalists"
     uses = ("closed_form", "random", "adaptive")
-    needs_records = True
     count: Whole = Field(3, ge=1, le=1000)
     include: dict[Name, dict[str, Value]] = Field({}, max_length=100)
 
@@ -202,17 +203,25 @@ def evaluate_finalist(
         raise StudyError(
             f"finalist {finalist.id}: its predictions on a split are not finite; leave it out, or train it anew."
         )
-    interval = crossed_interval(units)
+    why = _why_one_says_little(finalist) or why_no_interval(*units.shape)
+    interval = None if why else crossed_interval(units)
     facts = Errors(
         error=mean,
         in_words=objective.in_words(mean),
         measures={name: _mean_of_seeds([table.measures[name] for table in tables]) for name in objective.measures},
         ci95=None if interval is None else (min(interval[0], mean), max(interval[1], mean)),
-        why_no_interval=why_no_interval(*units.shape),
+        why_no_interval=why,
         by_seed=dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         units=Units(count=units.shape[1], worst=float(units.mean(axis=0).max())),
     )
     return facts, units
+
+
+def _why_one_says_little(finalist: Retrained) -> str:
+    """Why a single training gives no interval, or ""; a closed form has no chance of trainings."""
+    if len(finalist.records) > 1 or finalist.records[0].is_closed_form:
+        return ""
+    return f"1 training says too little of others; at least {FEWEST} are needed"
 
 
 def _mean_of_seeds(values: Sequence[float | None]) -> float | None:
@@ -227,10 +236,10 @@ def finalist_entry(
     config = finalist.records[0].config
     return FinalistEntry(
         id=finalist.id,
-        in_words=load_model(finalist.best_checkpoint).settings.in_words,
+        in_words=_in_words(load_model(finalist.best_checkpoint)),
         config=FinalistConfig(network=config["network"], training=config["training"], parameters=config["parameters"]),
         num_parameters=config["num_parameters"],
-        updates=config["training"]["updates"],
+        updates=round(np.mean([record.log[-1]["updates"] for record in finalist.records])),
         fall_at_the_end=fall_at_the_end(finalist.records),
         valid=valid,
         test=test,
@@ -238,7 +247,14 @@ def finalist_entry(
         stability=stability,
         checkpoint=str(finalist.best_checkpoint.relative_to(run.path)),
         train_seconds=float(np.mean([record.log[-1]["seconds"] for record in finalist.records])),
+        train_cpu_seconds=_mean_of_seeds([record.log[-1].get("cpu_seconds") for record in finalist.records]),
     )
+
+
+def _in_words(model: Model) -> str:
+    """What a model's network is, and whether it corrects another model's step."""
+    after = "" if model.predictor is None else f" after a predictor, a {model.predictor.settings.in_words}"
+    return f"{model.settings.in_words}{after}"
 
 
 def complete_cards(finalist: Retrained, test: Errors, environment: Mapping) -> None:

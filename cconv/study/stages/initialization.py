@@ -30,6 +30,7 @@ class InitializationStage(Stage):
     """
 
     kind: Literal["initialization"] = "initialization"
+    counts_updates = True
     is_single = True
     seeds: Whole = Field(5, ge=2, le=1000)
     configurations: Whole = Field(16, ge=2, le=MOST_TRIALS)

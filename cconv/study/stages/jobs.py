@@ -26,7 +26,7 @@ def trial_job(session: Session, stage: str, number: int, parameters: Mapping, in
 
 def train_all(session: Session, stage: str, jobs: Sequence[Job], training: TrainingConfig) -> None:
     """Train every job to the full budget of `training`, without early stopping."""
-    session.observer.on_stage(stage, len(jobs), training.updates)
-    queue = TrialQueue(jobs, training.updates, NothingStops(), session.observers(mirrored=False))
+    session.observer.on_stage(stage, len(jobs), training)
+    queue = TrialQueue(jobs, training, NothingStops(), session.observers(mirrored=False))
     if any(not TrialFolder(job.folder).ended for job in jobs):
         session.start_pool().run(queue, stage, training)

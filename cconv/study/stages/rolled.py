@@ -13,7 +13,13 @@ from cconv.data.splits import evenly_spaced
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.window import window_at
 from cconv.evaluation.checks.rolled import SeriesCheck
-from cconv.evaluation.recorded_rollout import RecordedRollout, asked_rollout, record_rollout, write_rollout
+from cconv.evaluation.recorded_rollout import (
+    MOST_SINKHORN,
+    RecordedRollout,
+    asked_rollout,
+    record_rollout,
+    write_rollout,
+)
 from cconv.evaluation.rollout_comparison import FlowMetrics
 from cconv.models.checkpoint import load_model
 from cconv.models.model import Model
@@ -70,8 +76,9 @@ def _of_finalist(
         for number in evenly_spaced(len(dataset.splits["test"]), MOST_TRAJECTORIES):
             stored = StoredFrames(dataset, "test", number)
             is_first = number == 0 and checkpoint == finalist.best_checkpoint
+            folder, transported = (animated, MOST_SINKHORN) if is_first else (None, 0)
             try:
-                found = _rolled(session, model, task, stored, checks, animated if is_first else None)
+                found = _rolled(session, model, task, stored, checks, transported, folder)
             except Diverged as error:
                 lost.append(f"{record.id}, trajectory {stored.name}: {error}")
             else:
@@ -85,16 +92,17 @@ def _rolled(
     task: StepTask,
     stored: StoredFrames,
     checks: Sequence[SeriesCheck],
+    most_sinkhorn: int,
     animated: Path | None,
 ) -> dict:
-    """Record a rollout over a whole trajectory, as values of `RolledTrajectory`.
+    """Record a rollout over a whole trajectory, as values of `RolledTrajectory`; write it where it is to be animated.
 
     Raises:
         Diverged: If it has no frame.
         KeyboardInterrupt: After Ctrl-C.
     """
     asked = asked_rollout(task, stored, session.dataset.scene)
-    asked = replace(asked, stride=math.ceil(asked.frames / LOOKS), most_sinkhorn=0)
+    asked = replace(asked, stride=math.ceil(asked.frames / LOOKS), most_sinkhorn=most_sinkhorn)
     frames = [asked.start.present.double()]
 
     def keep(positions: Tensor, _: Tensor) -> None:
@@ -120,6 +128,7 @@ def _values(recorded: RecordedRollout, stored: int) -> dict:
         "stored": stored,
         "mse": tuple(metrics.mse.tolist()),
         "looked_at": tuple(metrics.frames.tolist()),
+        "sinkhorn": tuple(metrics.sinkhorn.tolist()),
         "rollout": _series(metrics.rollout),
         "reference": _series(metrics.reference),
         "ended": recorded.ended or "",

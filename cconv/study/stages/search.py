@@ -18,6 +18,7 @@ class SearchStage(Stage):
     """
 
     space_kinds = ("refine",)
+    counts_updates = True
     trials: Trials = 16
     space: Name | None = None
 
@@ -36,7 +37,7 @@ class SearchStage(Stage):
         file = RungFile(session.run.path / "rungs.json")
         table = file.table(name, study.rungs, study.search.reduction_factor)
         judge = StopsByRungs(file, name, table, study.search.give_up_above)
-        session.observer.on_stage(name, self.trials, study.training.updates)
-        queue = TrialQueue(self.jobs(session, name), study.training.updates, judge, session.observers(mirrored=True))
+        session.observer.on_stage(name, self.trials, study.training)
+        queue = TrialQueue(self.jobs(session, name), study.training, judge, session.observers(mirrored=True))
         session.start_pool().run(queue, name, study.training)
         return Found()

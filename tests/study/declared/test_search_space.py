@@ -9,7 +9,13 @@ from cconv.networks import RadialNetSettings
 from cconv.networks.counting import CountedCost
 from cconv.study.declared.configuration import DEFAULTS, configure
 from cconv.study.declared.domains import Choice, SearchSpace, fixed, narrowed
-from cconv.study.declared.search_space import check_baseline_affordable, load_space, longest_history, may_add_force
+from cconv.study.declared.search_space import (
+    check_baseline_affordable,
+    load_space,
+    longest_history,
+    may_add_force,
+    study_space,
+)
 from cconv.study.stages.closed_form import MOST_LAYERS, single_layers
 from cconv.study.studies import load_study
 
@@ -417,3 +423,26 @@ def test_a_relaxation_needs_a_size_and_a_step():
         load_study(REPOSITORY / "experiments" / "rollout.toml", ["rollout.relaxation.loops=3"])
     with pytest.raises(ConfigError, match=r"rollout\.relaxation: is for steps, and 'density_gradient' is a field"):
         load_study(REPOSITORY / "experiments" / "smoke.toml", ["rollout.relaxation.alpha=0.01"])
+
+
+def test_a_study_has_a_baseline_of_its_own(space_file):
+    path = space_file(FLOAT + CHOICE)
+    study = load_study(REPOSITORY / "experiments" / "quick.toml", [f"search.space={path}"])
+    own = study.search.model_copy(update={"baseline": {"training.learning_rate": 5e-3}})
+    space = study_space(study.model_copy(update={"search": own}))
+    assert space.baseline == {"training.learning_rate": 5e-3, "network.window": "poly6"}
+    assert study_space(study).baseline["training.learning_rate"] == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("baseline", "message"),
+    [
+        ({"training.learning_rate": 1.0}, r"`search\.baseline\.training\.learning_rate`.*must lie in the range"),
+        ({"training.noise": 0.1}, r"`search\.baseline\.training\.noise`: no such parameter"),
+    ],
+)
+def test_a_baseline_lies_within_the_space(baseline, message, space_file):
+    study = load_study(REPOSITORY / "experiments" / "quick.toml", [f"search.space={space_file(FLOAT + CHOICE)}"])
+    own = study.search.model_copy(update={"baseline": baseline})
+    with pytest.raises(ConfigError, match=message):
+        study_space(study.model_copy(update={"search": own}))

@@ -54,6 +54,34 @@ def test_what_does_not_fit_is_named(stages, message):
         study(**stages)
 
 
+def test_finalists_need_no_search_before_them():
+    named = study(finalists={"include": {"named": {"network.layers": 1}}}, select={}).stages
+    assert reads_of(named, "finalists") == []
+    assert reads_of(named, "select") == ["finalists"]
+
+
+@pytest.mark.parametrize(
+    ("stages", "counting"),
+    [
+        ({"random": {}}, "random"),
+        ({"initialization": {}}, "initialization"),
+        ({"finalists": {}, "converge": {"budgets": [10]}}, "converge"),
+    ],
+)
+def test_a_budget_of_time_is_for_stages_that_do_not_count_updates(stages, counting):
+    timed = {"name": "s", "task": "density_rate", "search": SEARCH, "training": {"cpu_seconds": 60.0}}
+    with pytest.raises(ConfigError, match=f"stage `{counting}` compares trainings after equal numbers of updates"):
+        validated(Study, timed | {"stages": stages}, "s.toml").check_stages()
+    others = {"baseline": {}, "closed_form": {}, "finalists": {}, "select": {}}
+    validated(Study, timed | {"stages": others}, "s.toml").check_stages()
+
+
+def test_closed_forms_need_a_loss_that_least_squares_minimises():
+    weighted = {"name": "s", "task": "density_rate", "search": SEARCH, "training": {"loss": "neighbor_weighted"}}
+    with pytest.raises(ConfigError, match=r"training\.loss. must be 'mse' or 'balanced_mse' for stage `closed_form`"):
+        validated(Study, weighted | {"stages": {"closed_form": {}, "finalists": {}}}, "s.toml").check_stages()
+
+
 def test_a_stage_that_converges_names_finalists_that_are_sure_to_be_there():
     stages = {"random": {}, "finalists": {"include": {"named": {"network.layers": 1}}}}
     named = study(**stages, converge={"budgets": [10, 20], "of": ["baseline", "named"]}, select={}).stages

@@ -8,7 +8,7 @@ from cconv.errors import ConfigError
 from cconv.study.studies import load_study
 
 REPOSITORY = Path(__file__).parents[3]
-STUDIES = sorted((REPOSITORY / "experiments").glob("*.toml"))
+STUDIES = sorted((REPOSITORY / "experiments").rglob("*.toml"))
 
 MINIMAL = """
 name = "mini"
@@ -57,7 +57,7 @@ def test_settings_replace_those_of_the_file(study_file):
         ('[stages.random]\n[stages.refine]\nreads = ["rando"]', "`refine` names `rando`.* Did you mean 'random'"),
         ("[training]\nupdates = 10", "grace_updates .50. must not exceed"),
         ("grace_updates = 60", "multiple of"),
-        ("[finalists]\nseeds = 1", r"`finalists\.seeds`: .*greater than or equal to 2"),
+        ("[finalists]\nseeds = 0", r"`finalists\.seeds`: .*greater than or equal to 1"),
         ("[trainin]\nupdates = 10", "unknown key `trainin`. Did you mean 'training'"),
         ("give_up_above = inf", r"`search\.give_up_above`: input should be a finite number, got inf"),
         ("trial_seconds = 1e300", r"`search\.trial_seconds`: input should be less than or equal to 10000000"),

@@ -13,6 +13,7 @@ from processes import PATIENCE
 from troubles import BrokenJudge, jobs_in, study_of, trained_in, troubled_problem
 
 from cconv.errors import ConfigError
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.trials import TrialFolder
 from cconv.study.running.event_file import EVENT_FILE
 from cconv.study.running.ray_pool import STARTS, RayPool, _Driver, _start, ray_pool
@@ -141,7 +142,7 @@ class NamedTrial(NamedTuple):
 def test_one_whose_process_died_before_it_wrote_its_configuration_has_a_record(tmp_path):
     """As on a machine so busy that a process is ended at its limit before it has begun."""
     (job,) = jobs_in(tmp_path, [7])
-    queue = TrialQueue([job], 2, None, [])
+    queue = TrialQueue([job], TrainingConfig(), None, [])
     assert queue.next() is job
     _Driver(queue, "random").on_trial_error(0, [], NamedTrial(job.name, {"job": job}))
     record = TrialFolder(job.folder).read()

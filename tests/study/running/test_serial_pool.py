@@ -5,7 +5,7 @@ import errno
 import pytest
 import torch
 from systems import problem as sound_problem
-from troubles import FULL, BrokenJudge, end_of, jobs_in, study_of, trained_in, troubled_problem
+from troubles import BrokenJudge, end_of, jobs_in, study_of, trained_in, troubled_problem
 
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import load_model
@@ -96,7 +96,7 @@ def test_trainings_compute_on_one_thread_as_those_of_ray_do_and_threads_are_rest
     torch.set_num_threads(2)
     try:
         study = study_of(flow_folder)
-        queue = TrialQueue(jobs_in(tmp_path, [0]), FULL, Watching(), [])
+        queue = TrialQueue(jobs_in(tmp_path, [0]), study.training, Watching(), [])
         SerialPool(study, sound_problem(generator, study.task.name)).run(queue, "random", study.training)
         assert (seen, torch.get_num_threads()) == ([1, 1], 2)
     finally:

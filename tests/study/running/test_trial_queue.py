@@ -2,6 +2,7 @@
 
 import pytest
 
+from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.study_file import rungs_up_to
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.rungs import RungFile
@@ -36,7 +37,9 @@ def asha(run, give_up_above=10.0):
 
 
 def queue(run, count=12, judge=None, observers=()):
-    return TrialQueue((job(run, number) for number in range(count)), FULL, judge or asha(run), observers)
+    return TrialQueue(
+        (job(run, number) for number in range(count)), TrainingConfig(updates=FULL), judge or asha(run), observers
+    )
 
 
 def error_of(number, updates):
@@ -129,6 +132,15 @@ def test_without_a_judge_all_go_to_the_end(tmp_path):
     run = RunFolder(tmp_path)
     work(run, queue(run, judge=NothingStops()))
     assert all('"completed"' in end for end in ends(run).values())
+
+
+def test_a_training_whose_time_is_spent_is_completed_however_few_its_updates(tmp_path):
+    """Also where the record of an earlier version says nothing of the time, only its updates count."""
+    given = TrialQueue([], TrainingConfig(updates=FULL, cpu_seconds=10.0), NothingStops(), [])
+    outcomes = [
+        given.outcome_after(entry(3, 1.0) | spent) for spent in ({"cpu_seconds": 10.5}, {"cpu_seconds": 9.5}, {})
+    ]
+    assert outcomes == ["completed", "stopped", "stopped"]
 
 
 def test_observers_hear_of_every_trial_from_its_start_to_its_end(tmp_path):

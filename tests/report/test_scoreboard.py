@@ -1,0 +1,110 @@
+"""The scoreboard: a row is what its finalist measured, and what others report stands beside it for their data alone."""
+
+import math
+
+import numpy as np
+import pytest
+from summaries import SAMPLE, changed, finalist, rollouts, solver_comparison
+
+from cconv.report.compared_runs import ComparedRun, Inputs
+from cconv.report.comparison import write_comparison
+from cconv.report.published import published_errors, published_table
+from cconv.report.scoreboard import OURS, matrix, scores_table
+from cconv.study.records.run_folder import RunFolder
+
+
+def steps(folder="runs/data/2D_TGV_2500_10kevery100", horizon=20, ended=""):
+    """A study of steps with two finalists, of which the second errs three times as much and may end early."""
+    summary = RunFolder(SAMPLE).summary()
+    models = [
+        changed(finalist("large", error=3e-6), train_cpu_seconds=90.0),
+        finalist(summary.recommended.id, error=1e-6),
+    ]
+    with_five = [changed(each, test=changed(each.test, measures={"MSE5": each.test.error / 9})) for each in models]
+    summary = changed(
+        summary,
+        task=changed(summary.task, horizon=horizon),
+        dataset=changed(summary.dataset, path=folder),
+        finalists=with_five,
+        solver=solver_comparison(1e-8, 1e-5),
+        rolled=("large",),
+    )
+    return ComparedRun(label="s", summary=summary, inputs=Inputs(), rollouts={"large": rollouts(ended)})
+
+
+def test_rows_are_the_finalists_by_error_then_what_they_are_measured_by():
+    scores = scores_table([steps()])
+    ours = scores[scores["source"] == OURS]
+    assert ours["error"].tolist() == [1e-6, 3e-6, 1e-8, ours["error"].iloc[-1]]
+    assert ours["network"].tolist()[2:] == ["SPH solver", "predicting the mean"]
+    best, large = ours.head(2).to_dict("records")
+    assert (large["to_best"], large["mse5"]) == (pytest.approx(3), pytest.approx(3e-6 / 9))
+    assert (large["cpu_minutes"], large["hours"]) == (1.5, pytest.approx(3 / 3600))
+    assert math.isnan(best["cpu_minutes"])
+    assert (large["ci95_low"], large["ci95_high"]) == (1.5e-6, 6e-6)
+
+
+def test_whole_rollouts_are_means_over_trainings_and_trajectories():
+    (row,) = scores_table([steps()]).query("model == 'large'").to_dict("records")
+    assert row["mse"] == pytest.approx(np.mean([1e-6 * (frame + 1) ** 2 for frame in range(12)]))
+    assert row["e_kin"] == pytest.approx(np.mean([(0.1 * 0.9**look) ** 2 for look in range(4)]))
+    assert row["frames"] == 12
+    assert math.isnan(row["ended"])
+    assert math.isnan(row["sinkhorn"])  # these records have none
+    assert math.isnan(row["mse_low"])  # two trainings over two trajectories are too few
+
+
+def test_a_rollout_that_ends_early_has_no_error_but_its_frame():
+    (row,) = scores_table([steps(ended="diverged")]).query("model == 'large'").to_dict("records")
+    assert (row["ended"], row["frames"]) == (7, 12)
+    assert math.isnan(row["mse"])
+
+
+def test_published_rows_are_those_of_the_same_data():
+    found, other = (scores_table([steps(folder)]) for folder in ("2D_TGV_2500_10kevery100", "elsewhere"))
+    published = found[found["source"] != OURS]
+    assert set(published["network"]) == {"GNS-5-64", "GNS-10-128", "SEGNN-5-64", "SEGNN-10-64"}
+    assert published.query("source == 'checkpoints' and network == 'GNS-10-128'")["error"].tolist() == [5.9e-6]
+    assert (other["source"] == OURS).all()
+    assert published["updates"].isna().all()
+
+
+def test_errors_of_rollouts_of_another_length_are_not_compared_with_published_ones():
+    scores = scores_table([steps(horizon=10)])
+    assert scores[scores["source"] != OURS]["error"].isna().all()
+    assert published_errors(steps(horizon=10).summary) == {}
+    assert published_errors(steps().summary) == {"GNS-10-128": 5.9e-6, "SEGNN-10-64": 4.4e-6}
+
+
+def test_published_figures_are_positive_and_given_once():
+    table = published_table()
+    numbers = table.drop(columns=["data", "network", "source"])
+    assert ((numbers > 0) | numbers.isna()).all(axis=None)
+    assert not table.duplicated(["data", "network", "source"]).any()
+    assert (table[["mse20", "mse"]].notna().any(axis=1)).all()
+
+
+def test_networks_of_several_scenes_are_beside_each_other():
+    scores = scores_table([steps(), steps("2D_RPF_3200_20kevery100")])
+    wide = matrix(scores).set_index("network")
+    assert list(wide.columns) == ["2D_TGV_2500_10kevery100", "2D_RPF_3200_20kevery100"]
+    assert wide.loc["GNS-5-64, published"].tolist() == [9.6e-6, 9.8e-6]
+    assert matrix(scores_table([steps()])).empty
+
+
+def test_fields_have_no_scoreboard(tmp_path):
+    run = steps()
+    field = ComparedRun(
+        label="f", summary=changed(run.summary, task=changed(run.summary.task, horizon=None)), inputs=Inputs()
+    )
+    assert scores_table([field]).empty
+    write_comparison([field], tmp_path / "field.html")
+    assert "Scoreboard" not in (tmp_path / "field.html").read_text()
+
+
+def test_the_page_says_what_the_published_networks_were_trained_with(tmp_path):
+    write_comparison([steps(), steps("2D_RPF_3200_20kevery100", ended="diverged")], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "500,000 updates on an A6000" in page
+    assert "ends at frame 7" in page
+    assert "nan" not in page.lower().replace("finance", "")
