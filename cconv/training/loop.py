@@ -128,17 +128,14 @@ def train(
     check_choice("schedule", optimization.schedule, SCHEDULES)
     check_choice("loss", optimization.loss, LOSSES)
     progress = progress or begin(model)
-    if optimization.average > 0 and progress.average is None:
-        progress.average = begin_average(model)
-    judged = progress.average or model
+    judged = _judged(model, progress, optimization.average)
     start = time.perf_counter() - progress.seconds
     geometry = GeometryCache(model.geometry, cache_bytes)
     order = islice(batches(len(examples), optimization.batch_size, data_seed), progress.updates, None)
     while (share := optimization.share(progress)) < 1:
         began, update = time.process_time(), progress.updates + 1
-        rate = optimization.rate_at(share)
+        rate, steps = optimization.rate_at(share), optimization.steps_at(share)
         progress.optimizer.param_groups[0]["lr"] = rate
-        steps = optimization.steps_at(share)
         batch = examples.draw(next(order), update, model, steps, share)
         loss = _update(model, batch, progress.optimizer, geometry, LOSSES[optimization.loss], steps)
         if progress.average is not None:
@@ -163,6 +160,13 @@ def train(
         )
         if diverged:
             return
+
+
+def _judged(model: Model, progress: Progress, average: float) -> Model:
+    """The model that is evaluated: the average of its weights, which may begin here, or the model itself."""
+    if average > 0 and progress.average is None:
+        progress.average = begin_average(model)
+    return progress.average or model
 
 
 def _update(
