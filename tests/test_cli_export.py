@@ -2,7 +2,6 @@
 
 import json
 
-import jaxtyping
 import pytest
 import torch
 from contracts.test_tasks_and_networks import fresh
@@ -24,14 +23,6 @@ def checkpoint(generator, tmp_path):
     model, _, _ = fresh("density_rate", "radial_net", generator, layers=1)
     save_model(model, tmp_path / "checkpoint", {})
     return tmp_path / "checkpoint"
-
-
-@pytest.fixture
-def unchecked():
-    """Annotations are not checked, as checks do not know the symbols that stand for any number of particles."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import jaxtyping
 import pytest
 import torch
 from contracts.test_tasks_and_networks import fresh
@@ -71,14 +70,6 @@ def larger(observed, model, scene, generator):
     frame = periodic_frame(generator, 11)
     frame = replace(frame, boundary=observed.boundary)
     return (frame if model.config.history == 1 else window_of(frame, generator)), scene
-
-
-@pytest.fixture
-def unchecked():
-    """Annotations are not checked, as checks do not know the symbols that stand for any number of particles."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.integration
