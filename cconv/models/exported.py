@@ -22,7 +22,7 @@ from cconv.networks.network import WallInputs
 from cconv.tasks.features import CONSTANT, NORMAL, feature_unit, ordered_columns
 from cconv.tasks.inputs import Units
 
-DESCRIPTION = "cconv.json"  # beside the program, in its file
+DESCRIPTION = "description.json"  # beside the program, in its file
 UNITS = ("particle spacing", "rest density", "time between frames")  # what the input `units` holds
 
 
@@ -112,7 +112,7 @@ def export_model(model: Model, file: Path) -> dict:
         file: File to write (.pt2).
 
     Returns:
-        The description, which the file holds as `cconv.json`.
+        The description, which the file holds as `description.json`.
 
     Raises:
         ConfigError: If the model has a predictor, or torch cannot export its network.

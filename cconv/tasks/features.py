@@ -291,7 +291,9 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
         names: Features of the particles; no sum over neighbours is taken for those that are not named.
     """
     units = units_of_windows(state, scene)
-    lower, upper = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
+    lower, upper = (
+        [bound / scene.particle_spacing for bound in bounds] for bounds in (scene.box.lower, scene.box.upper)
+    )
     return Inputs(
         positions=(state.positions / units.length).float(),
         features=_particle_features(state, units, names),
