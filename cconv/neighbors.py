@@ -49,7 +49,12 @@ class Edges:
     @property
     def num_receivers(self) -> int:
         """Number of receiving points, those without a neighbour included."""
-        return len(self.row_splits) - 1
+        return self.row_splits.shape[0] - 1
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs E, also in a graph that is compiled for any."""
+        return self.receivers.shape[0]
 
     @property
     def neighbor_counts(self) -> Int[Tensor, " N"]:
@@ -73,7 +78,7 @@ class Edges:
     def apart(self) -> "Edges":
         """Pairs of points that are not at exactly the same place."""
         kept = self.distances > 0
-        if kept.all():
+        if not torch.compiler.is_compiling() and kept.all():
             return self
         ends = torch.cat([kept.new_zeros(1, dtype=torch.int64), kept.cumsum(0)])
         return replace(
@@ -86,11 +91,13 @@ class Edges:
         )
 
     def check(self) -> None:
-        """Require pairs that compiled loops can follow.
+        """Require pairs that compiled loops can follow; a compiled graph cannot ask, and does not.
 
         Raises:
             ShapeError: If pairs, row splits and numbers of points do not fit, or a displacement is not finite.
         """
+        if torch.compiler.is_compiling():
+            return
         if not _all_finite(self.displacements):
             raise ShapeError("`edges` must have finite displacements, got NaN or infinity; look at the positions.")
         lengths = {len(self.senders), len(self.receivers), len(self.displacements), int(self.row_splits[-1])}

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 from processes import PATIENCE
@@ -51,6 +52,14 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def generator():
     """A seeded source of random numbers; a test's draws do not depend on other tests."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def unchecked():
+    """Annotations are not checked, as checks do not know the symbols that stand for any number of particles."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Summaries for tests of the report, with as little and with as much as a study may find. All go through the types."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,7 +26,8 @@ from cconv.study.records.found import (
     TrialPoint,
     TriedRelaxation,
 )
-from cconv.study.records.rollouts import FinalistRollouts, FlowSeries, RolledTrajectory
+from cconv.study.records.rollouts import FinalistRollouts, FlowSeries, RolledTrajectory, write_rollouts
+from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.summary import (
     AnalyticCost,
     AttainmentStep,
@@ -489,3 +491,15 @@ def _comparison(name: str, number: int) -> ComparedModel:
         eligible=not worse,
         why_not="less accurate than the margin allows" if worse else "",
     )
+
+
+def whole_run_in(folder):
+    """A copy of the committed run with everything that a study may find."""
+    run = RunFolder(shutil.copytree(SAMPLE, folder / "run"))
+    summary = whole_summary(run.summary())
+    run.write_summary(summary)
+    for name in summary.explained:
+        np.savez(run.path / "explanation" / f"{name}.npz", **explanation())
+    for name in summary.rolled:
+        write_rollouts(run, name, rollouts())
+    return run

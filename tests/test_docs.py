@@ -7,12 +7,16 @@ import shutil
 from pathlib import Path
 
 import matplotlib.image
+import numpy as np
 import pytest
+import torch
 import typer.main
+from systems import untrained_step
 
 import cconv
 from cconv.cli import app
 from cconv.models.checkpoint import save_model
+from cconv.models.exported import export_model
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -61,16 +65,38 @@ def test_a_command_with_an_option_that_does_not_exist_is_found():
         parsed(["data", "inspect", "FOLDER", "--no-such-option"])
 
 
+def check_other_program(names):
+    """The program answers what analytic SPH does, and nothing is in the disc after any frame of the loop."""
+    edges = cconv.radius_graph(torch.tensor(names["positions"]), 0.2, cconv.Box([0, 0], [1, 1], (True, True)))
+    masses, velocities = torch.full((100,), 0.01, dtype=torch.float64), torch.tensor(names["velocities"])
+    rates = cconv.sph.density_rate(masses, velocities, edges, cconv.sph.CubicSpline(0.1, 2))
+    off = (names["rates"][:, 0].double() - rates).square().mean() / rates.var()
+    assert off < 1e-2  # a layer of sixteen terms, fitted to other frames
+    for positions in names["frames"][-5:]:
+        assert np.linalg.norm(positions - 0.5, axis=1).min() >= 0.1 - 1e-6
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
-def test_the_code_blocks_of_a_page_run(page, flow_folder, working_folder):
-    (working_folder / "FOLDER").symlink_to(flow_folder)
-    if '"LAYER"' in page.read_text():
-        save_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), working_folder / "LAYER", {})
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL))
+def test_the_code_blocks_of_a_page_run(page, flow_folder, steps_folder, working_folder):
+    text = page.read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    make = {
+        "FOLDER": lambda path: path.symlink_to(flow_folder),
+        "VORTICES": lambda path: path.symlink_to(steps_folder),
+        "LAYER": lambda path: save_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), path, {}),
+        "STEP": lambda path: save_model(untrained_step(steps_folder), path, {}),
+        "model.pt2": lambda path: export_model(cconv.fit_closed_form(cconv.open_dataset(flow_folder)), path),
+    }
+    for name, made in make.items():
+        if f'"{name}"' in code:
+            made(working_folder / name)
     names = {"__name__": page.stem}
     exec(compile(code, page.name, "exec"), names)
     expected = {"rates": (100, 1), "divergence": (100, 1), "answers": (50, 1)}
     assert all(names[name].shape == shape for name, shape in expected.items() if name in names)
+    if "beyond_disc" in names:
+        check_other_program(names)
     for written in ("MINE", "SQUARE"):
         if f'"{written}"' in code:
             assert list(cconv.open_dataset(written).splits) == ["train", "valid", "test"]

@@ -10,6 +10,7 @@ import typer
 from cconv.cli.console import INTERRUPTED, errors, results
 from cconv.cli.data import app as data_app
 from cconv.cli.doctor import doctor
+from cconv.cli.export import export
 from cconv.cli.imports import import_weights
 from cconv.cli.model import evaluate, fit, report, train
 from cconv.cli.rollout import rollout
@@ -24,7 +25,7 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
-for command in (train, fit, evaluate, rollout, report, doctor):
+for command in (train, fit, evaluate, rollout, export, report, doctor):
     app.command()(command)
 app.command("import")(import_weights)
 

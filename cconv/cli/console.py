@@ -1,11 +1,12 @@
 """The consoles of the commands: results go to stdout, progress and errors to stderr."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from rich.text import Text
 
 from cconv.errors import visible
@@ -54,3 +55,13 @@ def print_findings(findings: Iterable, console: Console = errors) -> None:
 def print_json(value: object) -> None:
     """Print plain values as JSON that a program can read."""
     print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def plain_table(title: str, rows: Mapping[str, str]) -> Table:
+    """Make a table of rows with a name and a value each, whose strings are shown as they are."""
+    table = Table(title=Text(title), show_header=False, title_justify="left")
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for label, text in rows.items():
+        table.add_row(label, Text(text))  # names and sources come from the data: read no markup in them
+    return table

@@ -1,54 +1,23 @@
 """`cconv data`: make, look at and convert particle data."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
-from rich.text import Text
 
-from cconv.cli.console import errors, print_findings, print_json, results, show_progress
+from cconv.cli.console import errors, plain_table, print_findings, print_json, results, show_progress
+from cconv.cli.data_import import import_files
+from cconv.cli.options import AsJson, DataFolder, Force, FrameDt, Mass, OutFolder, Overwrite, Spacing, open_data
 from cconv.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cconv.data.dataset import Dataset
     from cconv.scenes.simulated_scene import SimulatedScene
 
 # Commands import what they run inside, as torch takes seconds to load and `--help` should not.
 
 app = typer.Typer(help="Make, look at and convert particle data.", no_args_is_help=True)
-
-DataFolder = Annotated[
-    Path,
-    typer.Argument(
-        metavar="PATH",
-        help="Folder of the data: LagrangeBench (train.h5, valid.h5, test.h5, metadata.json) or "
-        "DeepLagrangianFluids (*.msgpack.zst).",
-    ),
-]
-OutFolder = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="Folder to write; it appears when it is complete.")
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an older data set in the folder.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs instead of a table.")]
-Mass = Annotated[
-    float | None,
-    typer.Option(help="Mass of every particle, if the data store none or wrong ones (DeepLagrangianFluids: 0.125)."),
-]
-Spacing = Annotated[
-    float | None,
-    typer.Option(help="Distance of neighbouring particles at rest; smoothing lengths scale with it."),
-]
-FrameDt = Annotated[
-    float | None, typer.Option(help="Time between stored frames, if the data do not store it or store a wrong one.")
-]
-Force = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y[,Z]", help="Constant external acceleration, e.g. gravity: '0,-9.81,0'. Few data sets store it."
-    ),
-]
+app.command("import")(import_files)
 
 
 @app.command()
@@ -168,7 +137,7 @@ def inspect(
     """
     from cconv.data.inspect import inspect_dataset
 
-    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    dataset = open_data(path, mass, particle_spacing, frame_dt, force)
     facts = inspect_dataset(dataset, cutoff, show_progress)
     if as_json:
         print_json(facts)
@@ -196,7 +165,7 @@ def check(
     from cconv.tasks import field_tasks
     from cconv.tasks.plausibility import field_findings
 
-    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    dataset = open_data(path, mass, particle_spacing, frame_dt, force)
     findings = dataset_findings(dataset, show_progress)
     if not any(finding.stops for finding in findings):
         findings += field_findings(dataset, field_tasks())
@@ -224,106 +193,8 @@ def convert(
     """
     from cconv.data.convert import convert as run
 
-    run(_open(path, mass, particle_spacing, frame_dt, force), out, overwrite, show_progress)
+    run(open_data(path, mass, particle_spacing, frame_dt, force), out, overwrite, show_progress)
     results.print(f"{path} as LagrangeBench HDF5: {out}", markup=False)
-
-
-@app.command(name="import")
-def import_files(
-    patterns: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="PATTERN...",
-            help="Files of the fluid, in the order of the last number in their names, or patterns such as 'run/*.vtu': "
-            ".vtu, .vtp, .vtk, .pvd, .vtu.series, .bgeo, .csv, .txt, .npz, .npy, .h5. Each folder is a simulation; so "
-            "is each file that holds several frames.",
-        ),
-    ],
-    out: OutFolder,
-    map_: Annotated[
-        str,
-        typer.Option(
-            "--map",
-            metavar="FIELD=NAME,...",
-            help="Names of arrays that are not found by usual ones, e.g. 'velocity=vel,density=rho,position=a+b'; "
-            "'id=' ignores one.",
-        ),
-    ] = "",
-    phase: Annotated[list[str] | None, typer.Option(metavar="PATTERN", help="Files of a further fluid.")] = None,
-    boundary: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PATTERN", help="Files of walls, obstacles or rigid bodies: one for all frames, or one a frame."
-        ),
-    ] = None,
-    types: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NUMBER=KIND,...",
-            help="Meaning of particle types: fluid, wall, moving (walls, rigid bodies), drop; e.g. '0=wall,3=fluid'.",
-        ),
-    ] = None,
-    fluid: Annotated[
-        int | None, typer.Option(help="Number of fluid particles, which come first in each file; moving walls follow.")
-    ] = None,
-    dt: Annotated[float | None, typer.Option(help="Time between frames, if files hold no times.")] = None,
-    name_time: Annotated[
-        float | None, typer.Option(metavar="UNIT", help="Times are the numbers in file names, times this unit.")
-    ] = None,
-    separate_frames: Annotated[
-        bool,
-        typer.Option(
-            "--separate-frames",
-            help="Make each frame a trajectory, for fields of the present frame: times may be irregular, particles may "
-            "enter and leave.",
-        ),
-    ] = False,
-    bounds: Annotated[
-        str | None, typer.Option(metavar="LOW:HIGH,...", help="Box, an interval for each axis; by default around all.")
-    ] = None,
-    periodic: Annotated[str, typer.Option(metavar="X,Y,Z", help="Periodic axes, e.g. 'x,y'; they need --bounds.")] = "",
-    gap: Annotated[int, typer.Option(help="Frames dropped between the splits of a single simulation.")] = 2,
-    mass: Mass = None,
-    particle_spacing: Spacing = None,
-    force: Force = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-) -> None:
-    """Make a data set of the particle files of any program; say what was found before anything is written.
-
-    Simulations are split into train, valid and test; a single one is cut in time. Lengths and times keep the units of
-    the files. `cconv data check DIR` tells whether the result is plausible.
-    """
-    from cconv.data.folders import check_free
-    from cconv.data.hdf5 import FILES
-    from cconv.data.importing.fields import parse_map
-    from cconv.data.importing.particles import parse_types
-    from cconv.data.importing.plan import plan_import
-    from cconv.data.importing.settings import ImportSettings
-
-    check_free(out.absolute(), FILES, overwrite)
-    settings = ImportSettings(
-        mapping=parse_map(map_) if map_ else {},
-        types=None if types is None else parse_types(types),
-        fluid=fluid,
-        dt=dt,
-        name_time=name_time,
-        particle_spacing=particle_spacing,
-        mass=mass,
-        force=None if force is None else parse_vector(force),
-        bounds=None if bounds is None else parse_bounds(bounds),
-        periodic=periodic,
-        separate_frames=separate_frames,
-        gap=gap,
-    )
-    plan = plan_import(patterns, settings, phases=phase or (), walls=boundary or (), progress=show_progress)
-    if not as_json:
-        results.print(_plain_table("Found", plan.found | {"not found": "\n".join(plan.missing) or "nothing"}))
-    plan.write(out, overwrite, show_progress)
-    if as_json:
-        print_json({"found": plan.found, "missing": list(plan.missing), "out": str(out)})
-    else:
-        results.print(f"Data set: {out}; next: cconv data check {out}", soft_wrap=True)
 
 
 @app.command()
@@ -386,7 +257,7 @@ def show(
         particles.animation_writer(animate)
     if every < 1:
         raise ConfigError(f"`--every` must be at least 1, got {every}.")
-    dataset = _open(path, mass, particle_spacing, frame_dt, force)
+    dataset = open_data(path, mass, particle_spacing, frame_dt, force)
     shown = dataset.trajectory(split, trajectory)
     chosen = evenly_spaced(len(shown), 4) if frames is None else parse_frames(frames)
     figure = particles.frames_chart(shown, dataset.scene, chosen, color, show_progress)
@@ -415,64 +286,8 @@ def parse_frames(text: str) -> list[int]:
         ) from error
 
 
-def parse_vector(text: str) -> tuple[float, ...]:
-    """Numbers separated by commas.
-
-    Raises:
-        ConfigError: If one is not a number.
-    """
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise ConfigError(f"`--force` must be numbers separated by commas, such as 0,-9.81,0, got {text!r}.") from error
-
-
-def parse_bounds(text: str) -> tuple[tuple[float, float], ...]:
-    """Intervals of axes, such as "0:1,0:2".
-
-    Raises:
-        ConfigError: If one is no interval.
-    """
-    try:
-        bounds = tuple((float(low), float(high)) for low, high in (part.split(":") for part in text.split(",")))
-    except ValueError as error:
-        raise ConfigError(f"`--bounds` must be LOW:HIGH,..., such as 0:1,0:2, got {text!r}.") from error
-    if not all(low < high for low, high in bounds):
-        raise ConfigError(f"`--bounds` must have a lower bound below the upper one on each axis, got {text!r}.")
-    return bounds
-
-
-def given_facts(
-    mass: float | None, particle_spacing: float | None, frame_dt: float | None, force: str | None
-) -> dict[str, Any]:
-    """What a user says of the data, by the names of `open_dataset`; None where he does not.
-
-    Raises:
-        ConfigError: If the force is no vector.
-    """
-    vector = None if force is None else parse_vector(force)
-    return {"mass": mass, "particle_spacing": particle_spacing, "frame_dt": frame_dt, "force": vector}
-
-
-def _open(
-    path: Path, mass: float | None, particle_spacing: float | None, frame_dt: float | None, force: str | None
-) -> "Dataset":
-    from cconv.data.dataset import open_dataset
-
-    return open_dataset(path, **given_facts(mass, particle_spacing, frame_dt, force))
-
-
 def _table(facts: dict) -> Table:
-    return _plain_table(facts["path"], dict(_rows(facts)))
-
-
-def _plain_table(title: str, rows: Mapping[str, str]) -> Table:
-    table = Table(title=Text(title), show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for label, text in rows.items():
-        table.add_row(label, Text(text))  # names and sources come from the data: read no markup in them
-    return table
+    return plain_table(facts["path"], dict(_rows(facts)))
 
 
 def _rows(facts: dict) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from cconv.cli.console import print_json, results
-from cconv.cli.data import AsJson
+from cconv.cli.options import AsJson
 
 if TYPE_CHECKING:
     from cconv.study.installation import Checked

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from cconv.cli.console import print_json, results
-from cconv.cli.data import AsJson
+from cconv.cli.options import AsJson
 from cconv.errors import ConfigError
 
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cconv.cli.console import errors, print_findings, print_json, results, show_progress
-from cconv.cli.data import Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.live import TrainingBar
-from cconv.cli.study import DataPath, RunPath, Settings, StudyFile
+from cconv.cli.options import Force, FrameDt, Mass, Spacing, given_facts
+from cconv.cli.study import DataPath, Log, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import Horizon, check_setting
 
@@ -35,6 +35,7 @@ def train(
     study: StudyFile,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write; it must not exist yet.")],
     data: DataPath = None,
+    log: Log = None,
     settings: Settings = None,
 ) -> None:
     """Train the network of a study file, without a search.
@@ -46,11 +47,12 @@ def train(
     from cconv.study.running.problem import provenance
     from cconv.study.running.trial import Trial, run_trial
 
-    config = _declared_study(study, data, settings, out)
+    config = _declared_study(study, data, settings, out, log)
     problem, dataset = _loaded_problem(config)
     folder = TrialFolder(out)
     seeds = {"init_seed": config.seeds.init, "data_seed": config.seeds.data}
-    trial = Trial(stage="train", parameters={}, provenance=provenance(config, dataset), **seeds)
+    origin = provenance(config, dataset)
+    trial = Trial(stage="train", parameters={}, provenance=origin, loggers=config.log, **seeds)
     try:
         with TrainingBar(errors, config.name) as bar:
             entries = list(run_trial(problem, trial, config.configuration, folder, on_update=bar.on_update))
@@ -324,12 +326,16 @@ def report(
         results.print(f"Tables: {len(files)} files in {tables}", soft_wrap=True)
 
 
-def _declared_study(study: Path, data: str | None, settings: list[str] | None, out: Path) -> "StudyConfig":
+def _declared_study(
+    study: Path, data: str | None, settings: list[str] | None, out: Path, log: list[str] | None = None
+) -> "StudyConfig":
     """Return the settings of a study whose single model is written to `out`, which must not exist yet."""
     from cconv.study.running.problem import with_data_path
+    from cconv.study.running.training_logs import with_loggers
     from cconv.study.studies import load_study
 
     config = load_study(study, settings or [])
+    config = with_loggers(config, config.log if log is None else log)
     if data is not None:
         config = with_data_path(config, data)
     if out.exists():

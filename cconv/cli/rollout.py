@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cconv.cli.console import INTERRUPTED, errors, print_findings, print_json, results, show_progress
-from cconv.cli.data import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.model import other_scales, recommended_checkpoint, relaxation_words, scale_facts
+from cconv.cli.options import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError, shown
 

@@ -64,6 +64,16 @@ Serial = Annotated[
 ]
 
 
+Log = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--log",
+        metavar="mlflow|wandb",
+        help="Log trainings for this program too, offline; replaces `log` of the study file. Repeatable.",
+    ),
+]
+
+
 @app.command()
 def run(
     study: StudyFile,
@@ -78,6 +88,7 @@ def run(
     address: Address = None,
     serial: Serial = False,
     storage: Storage = None,
+    log: Log = None,
     settings: Settings = None,
 ) -> None:
     """Run a whole study: every stage that its file declares, then the report.
@@ -91,10 +102,12 @@ def run(
     from cconv.study.pipeline import begin_study
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.running.problem import open_study_data, with_data_path
+    from cconv.study.running.training_logs import with_loggers
     from cconv.study.studies import load_study
 
     _check_place(address, serial)
     config = load_study(study, settings or [])
+    config = with_loggers(config, config.log if log is None else log)
     config.check_stages()
     if data is not None:
         config = with_data_path(config, data)

@@ -11,7 +11,7 @@ from torch import Tensor
 from cconv.batching import counts_of, groups_of, index_of
 from cconv.data.trajectory import Boundary, ParticleType, Trajectory
 from cconv.domain import Box
-from cconv.errors import DataError, ShapeError
+from cconv.errors import DataError, ShapeError, check_shape
 
 
 class Origin(NamedTuple):
@@ -211,6 +211,40 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
         boundary=trajectory.boundary,
         trajectory=trajectory.name,
         frame=trajectory.first_frame + present,
+    )
+
+
+def window_from_arrays(
+    positions: Any, masses: Any, particle_types: Any = None, boundary: Boundary | None = None
+) -> Window:
+    """The window of frames that another program holds, to ask a model of a step about.
+
+    Args:
+        positions: The past and the present, oldest first, (H, N, D), length.
+        masses: (N,).
+        particle_types: Values of `ParticleType`, (N,); None if all particles are fluid.
+        boundary: Wall points, or None.
+
+    Raises:
+        ShapeError: If shapes do not fit, or a position is not finite.
+    """
+    positions, masses = torch.as_tensor(positions), torch.as_tensor(masses)
+    if positions.ndim != 3:
+        raise ShapeError(f"`positions` must have shape (frames, particles, dim), got {tuple(positions.shape)}.")
+    if not torch.isfinite(positions).all():
+        raise ShapeError("`positions` must be finite, got NaN or infinity; look for a simulation that blew up.")
+    _, particles, _ = positions.shape
+    types = torch.zeros(particles, dtype=torch.int64) if particle_types is None else torch.as_tensor(particle_types)
+    check_shape("masses", masses.shape, (particles,))
+    check_shape("particle_types", types.shape, (particles,))
+    return Window(
+        positions=positions,
+        future=positions[:0],
+        masses=masses,
+        particle_types=types.long(),
+        boundary=boundary,
+        trajectory="arrays",
+        frame=len(positions) - 1,
     )
 
 

@@ -255,12 +255,15 @@ class Model(nn.Module):
         self, inputs: Inputs, geometry: FrameGeometry
     ) -> tuple[Float[Tensor, "N C_in"], Geometry, WallInputs[Geometry] | None]:
         """Return the inputs of the network: standardised features and geometry of the fluid and of the walls."""
-        flat = inputs.features.select(self.config.fluid_features).flat()
-        features = (flat - self.feature_mean) / self.feature_scale
-        arranged = self.settings.arrange(features, self.config.inputs, self.config.dim)
+        arranged = self.standardized(inputs.features.select(self.config.fluid_features).flat())
         if geometry.walls is None or inputs.wall_features is None:
             return arranged, geometry.fluid, None
         return arranged, geometry.fluid, WallInputs(inputs.wall_features.flat(), geometry.walls)
+
+    def standardized(self, flat: Float[Tensor, "N C"]) -> Float[Tensor, "N C_in"]:
+        """Features (N, C), in the order of `Features.flat`, standardised and as the network takes them."""
+        features = (flat - self.feature_mean) / self.feature_scale
+        return self.settings.arrange(features, self.config.inputs, self.config.dim)
 
     def standardize_target(self, target: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """Target (N, C) in a sample's units to standardised values."""

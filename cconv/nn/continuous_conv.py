@@ -133,7 +133,6 @@ def _filter_reads(
     sizes = kernel_size[::-1]
     cube = map_ball_to_cube(-edges.displacements / edges.cutoff, mapping)  # Λ takes x_j - x_i
     lowest, fractions, factor = interpolate(grid_coordinates(cube, sizes, align_corners), sizes, interpolation)
-    corners = corner_offsets(sizes)[: 2 ** fractions.shape[1]]
     return FilterReads(
         row_splits=edges.row_splits,
         receivers=edges.receivers,
@@ -141,7 +140,7 @@ def _filter_reads(
         cells=sum(map(torch.mul, lowest.unbind(1), strides(sizes)), start=torch.zeros_like(lowest[:, 0])),
         fractions=fractions,
         weights=importance(edges, window, normalize) * factor,
-        corner_offsets=torch.tensor(corners, dtype=torch.int32),
+        corner_offsets=tuple(corner_offsets(sizes)[: 2 ** fractions.shape[1]]),
         num_cells=math.prod(sizes),
         num_senders=edges.num_senders,
     )

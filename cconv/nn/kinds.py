@@ -23,7 +23,7 @@ def split_kinds(
 ) -> tuple[Float[Tensor, "N {kinds.scalars}"], Float[Tensor, "N {kinds.vectors} {dim}"]]:
     """Scalars (N, S) and vectors (N, V, D) of values (N, S + V · D)."""
     scalars, vectors = values.split([kinds.scalars, kinds.vectors * dim], dim=1)
-    return scalars, vectors.reshape(len(values), kinds.vectors, dim)
+    return scalars, vectors.reshape(values.shape[0], kinds.vectors, dim)
 
 
 def join_kinds(scalars: Float[Tensor, "N S"], vectors: Float[Tensor, "N V D"]) -> Float[Tensor, "N S+V*D"]:

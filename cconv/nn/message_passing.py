@@ -137,7 +137,7 @@ class MLP(nn.Module):
         if messages.applies(first, *(part for part, _ in gathered), *self.parameters()):
             output = first.new_empty(len(first), self.layers[-1].out_features)
             return messages.by_rows(some, output, sum(layer.weight.numel() for layer in self.layers))
-        return some(0, len(first))
+        return some(0, first.shape[0])
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator | None = None) -> nn.Linear:

@@ -149,13 +149,13 @@ class RadialGeometry:
             return FilterReads(
                 row_splits=edges.row_splits,
                 receivers=edges.receivers,
-                senders=torch.arange(len(edges), device=edges.senders.device),
+                senders=torch.arange(edges.num_pairs, device=edges.senders.device),
                 cells=lowest[:, 0].contiguous(),
                 fractions=fractions,
                 weights=ones if self.weights is None else self.weights,
-                corner_offsets=torch.tensor([0, min(1, terms - 1)], dtype=torch.int32),
+                corner_offsets=(0, min(1, terms - 1)),
                 num_cells=terms,
-                num_senders=len(edges),
+                num_senders=edges.num_pairs,
             )
 
     @contextmanager

@@ -193,7 +193,8 @@ def _own(reads: FilterReads) -> Rows:
 
 
 def _edges(reads: FilterReads) -> tuple[np.ndarray, ...]:
-    return tuple(t.detach().numpy() for t in (reads.cells, reads.fractions, reads.weights, reads.corner_offsets))
+    offsets = np.array(reads.corner_offsets, dtype=np.int32)
+    return *(t.detach().numpy() for t in (reads.cells, reads.fractions, reads.weights)), offsets
 
 
 def _gather(features: Tensor, reads: FilterReads, own: float) -> Callable[[int, int, Tensor], None]:

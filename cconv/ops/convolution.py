@@ -21,7 +21,7 @@ def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float =
         (N, C_out).
     """
     path = blocked if _is_fast(features, reads) else general
-    if general.multiplies_first(reads.num_senders, reads.num_receivers, *filters.shape[1:]):
+    if _multiplies_first(reads, *filters.shape[1:]):
         return path.multiply_then_read(features, filters, reads, own)
     return path.gather_then_multiply(features, filters, reads, own)
 
@@ -34,6 +34,13 @@ def columns(features: Tensor, reads: FilterReads, own: float = 0) -> Tensor:
     path = blocked if _is_fast(features, reads) else general
     with torch.no_grad():
         return path.columns(features, reads, own)
+
+
+def _multiplies_first(reads: FilterReads, in_channels: int, out_channels: int) -> bool:
+    """Whether that is cheaper; a compiled graph serves any numbers of points, and cannot ask for them."""
+    if torch.compiler.is_compiling():
+        return False
+    return general.multiplies_first(reads.num_senders, reads.num_receivers, in_channels, out_channels)
 
 
 def _is_fast(features: Tensor, reads: FilterReads) -> bool:

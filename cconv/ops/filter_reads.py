@@ -26,7 +26,7 @@ class FilterReads:
         cells: Lowest cell that each edge reads, (E,), int32.
         fractions: Position between the cells, (E, A), in [0, 1].
         weights: Window, border and 1/ψ of each edge, (E,).
-        corner_offsets: (2^A,), int32.
+        corner_offsets: Of the 2^A cells.
         num_cells: Cells of the grid, K^D.
         num_senders: Number of points that can be senders, M.
     """
@@ -37,14 +37,14 @@ class FilterReads:
     cells: Tensor
     fractions: Tensor
     weights: Tensor
-    corner_offsets: Tensor
+    corner_offsets: tuple[int, ...]
     num_cells: int
     num_senders: int
 
     @property
     def num_receivers(self) -> int:
         """Number of receiving points N."""
-        return len(self.row_splits) - 1
+        return self.row_splits.shape[0] - 1
 
     @property
     def num_corners(self) -> int:
@@ -70,7 +70,7 @@ class FilterReads:
 
     def corners(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Cell (E,), int64, and weight (E,) of each corner in turn."""
-        for corner, offset in enumerate(self.corner_offsets.tolist()):
+        for corner, offset in enumerate(self.corner_offsets):
             weights = self.weights
             for axis, fraction in enumerate(self.fractions.unbind(1)):
                 weights = weights * (fraction if corner >> axis & 1 else 1 - fraction)

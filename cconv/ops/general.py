@@ -42,7 +42,7 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
 def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
     """Multiply the features of each sender by the filter of every cell, then let the edges read; arguments as above."""
     num_cells, _, out_channels = filters.shape
-    products = (features @ filters.transpose(0, 1).flatten(1)).reshape(len(features) * num_cells, out_channels)
+    products = (features @ filters.transpose(0, 1).flatten(1)).reshape(features.shape[0] * num_cells, out_channels)
     output = features.new_zeros(reads.num_receivers, out_channels)
     for cells, weights in reads.corners():
         messages = products[reads.senders * num_cells + cells]

@@ -48,7 +48,8 @@ def filters_chart(explanation: Explanation) -> Figure:
     combined = "outputs combined by least squares" if explanation["is_combined"] else "as they are"
     differing = f"differ by {100 * float(explanation['unexplained']):.2g} % of |∇W|²"
     figure.suptitle(f"filters of the first layer, {combined}, {differing}")
-    panels[0].set_ylabel("filter, units of the data")
+    for axes in panels:
+        axes.set_ylabel("filter [units of the data]")
     return figure
 
 
@@ -72,9 +73,9 @@ def fields_chart(explanation: Explanation, symbol: str) -> Figure:
         (panels[0], target, f"analytic {symbol}"),
         (panels[1], prediction, f"predicted {symbol}"),
     ):
-        _draw_particles(axes, positions, values.ravel(), title, scale)
+        _draw_particles(axes, positions, values.ravel(), title, "units of the data", scale)
     largest = {"cmap": "magma_r", "vmin": 0, "vmax": float(np.quantile(error, 0.99)) or 1.0}
-    _draw_particles(panels[2], positions, error, "error, by the target's standard deviation", largest)
+    _draw_particles(panels[2], positions, error, "error of each particle", "standard deviations of the target", largest)
     return figure
 
 
@@ -91,6 +92,7 @@ def error_distribution_chart(explanations: Mapping[str, Explanation], baseline: 
         axes.stairs(counts / counts.sum(), bins, color=color, label=label)
         median = explanations[name]["error_quantiles"][list(explanations[name]["error_levels"]).index(0.5)]
         axes.axvline(median, color=color, lw=1, ls="--")
+    axes.set_title("errors of single particles")
     _fit_range(axes, [explanations[name] for name in shown])
     axes.set(
         xscale="log", xlabel="error of a particle, by the target's standard deviation", ylabel="share of particles"
@@ -138,13 +140,17 @@ def _slice(explanation: Explanation) -> np.ndarray:
     return np.abs(depth) <= float(explanation["particle_spacing"])
 
 
-def _draw_particles(axes: Axes, positions: np.ndarray, values: np.ndarray, title: str, scale: Mapping) -> None:
+def _draw_particles(
+    axes: Axes, positions: np.ndarray, values: np.ndarray, title: str, unit: str, scale: Mapping
+) -> None:
     height = positions[:, 1] if positions.shape[1] > 1 else np.zeros(len(positions))
     size = np.clip(40_000 / len(positions), 2, 40)
     drawn = axes.scatter(positions[:, 0], height, c=values, s=size, linewidths=0, rasterized=True, **scale)
-    axes.set(aspect="equal", xlabel="x", ylabel="y" if positions.shape[1] > 1 else "", title=title)
+    axes.set(
+        aspect="equal", xlabel="x [length]", ylabel="y [length]" if positions.shape[1] > 1 else "none", title=title
+    )
     axes.grid(False)
-    axes.figure.colorbar(drawn, ax=axes, extend="both", shrink=0.8)
+    axes.figure.colorbar(drawn, ax=axes, extend="both", shrink=0.8, label=unit)
 
 
 def _size(vectors: np.ndarray) -> np.ndarray:

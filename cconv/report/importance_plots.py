@@ -31,6 +31,8 @@ def importance_chart(entries: Sequence[RungImportance], title: str = "importance
         _shares(tested, entry, names)
         _estimates(estimated, entry, names)
         tested.set_ylabel(_sample(entry))
+    for axes in panels[-1]:
+        axes.set_xlabel("share, from 0 to 1")
     panels[0, 0].invert_yaxis()
     panels[0, 0].set_xlim(0, 1)
     for column in (0, 1):
@@ -108,7 +110,8 @@ def _dependence(axes: Axes, dependence: PartialDependence) -> None:
     drawn = [point.value for point in dependence.points]
     x = [values.index(value) for value in drawn] if choice else drawn
     axes.plot(x, [point.error for point in dependence.points], ".", color=_POINTS, alpha=0.6, ms=5, label="trial")
-    axes.set(yscale="log", title=dependence.parameter, xscale="log" if dependence.scale == "log" else "linear")
+    axes.set(yscale="log", title=dependence.parameter, xlabel="value")
+    axes.set_xscale("log" if dependence.scale == "log" else "linear")
     if not choice:
         axes.fill_between(positions, dependence.low, dependence.high, color=_FOUND, alpha=0.2, lw=0, label=_TREES)
         axes.plot(positions, dependence.error, color=_FOUND, label="surrogate", zorder=3)

@@ -47,7 +47,8 @@ def interactive_chart(summary: Summary) -> go.Figure:
     figure.update_xaxes(title="time per frame [ms]", type="log")
     figure.update_yaxes(title=f"error ({summary.task.error})", type="log", dtick=1, exponentformat="power")
     figure.update_yaxes(range=[math.log10(low), math.log10(high)])
-    figure.update_layout(template="plotly_white", height=620, hovermode="closest", margin={"t": 30, "r": 20})
+    figure.update_layout(template="plotly_white", height=640, hovermode="closest", margin={"t": 60, "r": 20})
+    figure.update_layout(title={"text": "error and time per frame of each model", "font": {"size": 15}})
     figure.update_layout(legend={"orientation": "h", "y": -0.15}, hoverlabel={"align": "left"})
     return figure
 

@@ -85,7 +85,9 @@ def best_so_far_chart(trials: pd.DataFrame, summary: Summary | None = None) -> F
     )
     complete = trials["valid_error"].where(trials["outcome"] == "completed")
     axes.step(order, complete.cummin().ffill(), where="post", color="0.5", label="best of the full budget")
-    axes.set(yscale="log", xlabel="trial", ylabel=f"last {_error_label(summary)}", title="search")
+    axes.set(
+        yscale="log", xlabel="trial, in order", ylabel=f"last {_error_label(summary)}", title="error of each trial"
+    )
     if summary is not None:
         mark_mean_predictor(axes.axhline, summary.mean_predictor.valid)
     _legend(axes, **_BESIDE)
@@ -114,7 +116,8 @@ def rung_audit_chart(summary: Summary) -> Figure:
     panels[0].vlines(table["updates"], table["spearman_low"], table["spearman_high"])
     for axes, name in zip(panels, AUDIT_MEASURES, strict=True):
         axes.plot(table["updates"], table[name].astype(float), marker="o")
-        axes.set(xscale="log", xlabel="updates at the rung", title=AUDIT_MEASURES[name])
+        label = "final error ÷ the best" if name == "regret" else AUDIT_MEASURES[name]
+        axes.set(xscale="log", xlabel="gradient updates at the rung", ylabel=label, title=AUDIT_MEASURES[name])
         axes.set_xticks(table["updates"], table["updates"], minor=False)
         axes.minorticks_off()
     return figure

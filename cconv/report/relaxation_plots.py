@@ -30,6 +30,7 @@ def relaxations_chart(relaxed: Relaxed) -> Figure:
         axes.set_title(name, parse_math=False)
         axes.set(yscale="log", xlabel="loops of the relaxation in a frame, 0 for none")
     panels[0].set_ylabel("measures ÷ without relaxation")
+    figure.suptitle("relaxations that were tried, by model")
     points = panels[-1].collections[0]
     figure.colorbar(points, ax=list(panels), label="alpha, size of a shift")
     return figure

@@ -34,7 +34,8 @@ def rollout_errors_chart(rollouts: Rollouts) -> Figure:
         for each in rollouts[name].rolled:
             if each.ended:
                 axes.plot(len(each.mse), each.mse[-1], "x", color=color)
-    axes.set(yscale="log", xlabel="frame of the rollout", ylabel="mean squared error of the positions")
+    axes.set(yscale="log", xlabel="frame of the rollout", ylabel="mean squared error of the positions [length²]")
+    axes.set_title("error of the rollouts")
     _legend(axes)
     return figure
 
@@ -51,8 +52,9 @@ def energy_chart(rollouts: Rollouts) -> Figure:
                 axes.plot(each.looked_at, each.rollout.e_kin, color=color, lw=1.2, marker=".", ms=3, label=label)
         longest = max(_of_trajectory(rollouts, trajectory), key=lambda each: len(each.looked_at))
         axes.plot(longest.looked_at, longest.reference.e_kin, color=ANALYTIC_COLOR, ls="--", label="stored")
-        axes.set(yscale="log", xlabel="frame of the rollout", ylabel="kinetic energy")
+        axes.set(yscale="log", xlabel="frame of the rollout", ylabel="kinetic energy [units of the data]")
         axes.set_title(trajectory, parse_math=False)  # a name in the data
+    figure.suptitle("kinetic energy of the rollouts, by trajectory")
     _legend(panels[-1])
     return figure
 
@@ -67,6 +69,8 @@ def distributions_chart(rollouts: Rollouts) -> Figure:
         _draw_shares(axes, everywhere, name, ANALYTIC_COLOR, "stored")
     panels[0].set(xlabel="neighbours within 1.45 particle spacings", ylabel="share of particles")
     panels[1].set(xlabel="speed, in bins up to the largest stored one", ylabel="share of particles", yscale="log")
+    panels[0].set_title("neighbours of the particles")
+    panels[1].set_title("speeds of the particles")
     _legend(panels[1])
     return figure
 

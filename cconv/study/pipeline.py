@@ -34,6 +34,7 @@ from cconv.study.running.problem import (
     with_data_path,
 )
 from cconv.study.running.serial_pool import SerialPool
+from cconv.study.running.training_logs import check_loggers
 from cconv.study.stages.search import SearchStage
 from cconv.study.stages.session import Progress, Session
 from cconv.study.studies import recorded_space, recorded_study
@@ -75,7 +76,7 @@ def run_study(
         The summary; None if no stage selects.
 
     Raises:
-        ConfigError: If another run works in the folder, or a stage cannot go on.
+        ConfigError: If another run works in the folder, a logger is not installed, or a stage cannot go on.
         DataError: If the data or records cannot be read.
     """
     stage = "data"
@@ -84,6 +85,7 @@ def run_study(
         remove_left_behind(run.path / RAY_FILES)
         try:
             study, space = recorded_study(run), recorded_space(run)
+            check_loggers(study.log)
             run.set_state("running", stage)
             with _session(study, space, run, observer, progress, address, storage, serial) as session:
                 for stage, settings in study.stages.items():

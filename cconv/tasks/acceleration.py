@@ -1,5 +1,7 @@
 """The acceleration that leads to the next stored frame."""
 
+from torch import Tensor
+
 from cconv.nn.kinds import Kinds
 from cconv.tasks.features import (
     ACCELERATIONS,
@@ -58,6 +60,6 @@ class Acceleration(StepTask):
     checks = ("completion", "motion", "packing", "perturbed_starts", "mapped_starts", "later_start")
     moved_by = SemiImplicitEuler()
 
-    def unit(self, units: Units) -> float:
+    def unit(self, units: Units) -> float | Tensor:
         """A particle spacing per frame, squared."""
         return units.length

@@ -241,20 +241,44 @@ def window_state(
 
 
 # The velocity is the last of the vectors: networks that know it only as differences leave out the last.
-_SCALARS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N,) or (N, S) of a state
-    CONSTANT: lambda state, units: torch.ones_like(state.masses),
-    DENSITY: lambda state, units: (state.densities[:, None] / units.density)[:, 0],
-    PRESSURE_SOURCE: lambda state, units: state.pressure_sources * units.time**2,
-    PARTICLE_TYPE: lambda state, units: (~state.is_fluid).double(),
-    WALL_DISTANCE: lambda state, units: state.wall_distances,
-    TYPE_ONE_HOT: lambda state, units: one_hot(state.particle_types.clamp(0, NUM_TYPES - 1), NUM_TYPES).double(),
+_SCALARS: dict[str, Callable[[Any], Tensor]] = {  # (N,) or (N, S) of a state, in the units of the data
+    CONSTANT: lambda state: torch.ones_like(state.masses),
+    DENSITY: lambda state: state.densities,
+    PRESSURE_SOURCE: lambda state: state.pressure_sources,
+    PARTICLE_TYPE: lambda state: (~state.is_fluid).double(),
+    WALL_DISTANCE: lambda state: state.wall_distances,
+    TYPE_ONE_HOT: lambda state: one_hot(state.particle_types.clamp(0, NUM_TYPES - 1), NUM_TYPES).double(),
 }
-_VECTORS: dict[str, Callable[[Any, Units], Tensor]] = {  # (N, V, D) of a state
-    ACCELERATIONS: lambda state, units: state.accelerations / units.acceleration,
-    FORCE: lambda state, units: state.forces[:, None] / units.acceleration,
-    WALL_NORMAL: lambda state, units: state.wall_normals[:, None],
-    VELOCITY: lambda state, units: state.velocities[:, None] / units.velocity,
+_VECTORS: dict[str, Callable[[Any], Tensor]] = {  # (N, V, D) of a state, in the units of the data
+    ACCELERATIONS: lambda state: state.accelerations,
+    FORCE: lambda state: state.forces[:, None],
+    WALL_NORMAL: lambda state: state.wall_normals[:, None],
+    VELOCITY: lambda state: state.velocities[:, None],
 }
+_UNITS: dict[str, Callable[[Units], float | Tensor]] = {  # of those features that have one
+    DENSITY: lambda units: units.density,
+    PRESSURE_SOURCE: lambda units: units.time**-2,
+    ACCELERATIONS: lambda units: units.acceleration,
+    FORCE: lambda units: units.acceleration,
+    VELOCITY: lambda units: units.velocity,
+}
+
+
+def feature_unit(name: str, units: Units) -> float | Tensor:
+    """What a network takes multiples of as a feature, in the units of the data; 1 for a feature without a unit."""
+    return _UNITS[name](units) if name in _UNITS else 1.0
+
+
+def ordered_columns(names: Collection[str], history: int, dim: int) -> tuple[str, ...]:
+    """Name of the feature that each column of `Features.flat` belongs to, of features of a frame or window.
+
+    Args:
+        names: Features of the particles.
+        history: Frames of the windows.
+        dim: Number of space dimensions D.
+    """
+    ordered = [name for name in (*_SCALARS, *_VECTORS) if name in names]
+    return tuple(name for name in ordered for _ in range(kinds_of([name], history).num_values(dim)))
 
 
 def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, names: Collection[str]) -> Inputs:
@@ -267,7 +291,9 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
         names: Features of the particles; no sum over neighbours is taken for those that are not named.
     """
     units = units_of_windows(state, scene)
-    lower, upper = ([bound / units.length for bound in bounds] for bounds in (scene.box.lower, scene.box.upper))
+    lower, upper = (
+        [bound / scene.particle_spacing for bound in bounds] for bounds in (scene.box.lower, scene.box.upper)
+    )
     return Inputs(
         positions=(state.positions / units.length).float(),
         features=_particle_features(state, units, names),
@@ -281,9 +307,9 @@ def make_inputs(state: FluidState, boundary: Boundary | None, scene: Scene, name
 
 
 def _particle_features(state: FluidState, units: Units, names: Collection[str]) -> Features:
-    scalars = {name: feature(state, units) for name, feature in _SCALARS.items() if name in names}
-    vectors = {name: feature(state, units) for name, feature in _VECTORS.items() if name in names}
-    columns = {name: values.reshape(len(values), -1) for name, values in scalars.items()}
+    scalars = {name: feature(state) for name, feature in _SCALARS.items() if name in names}
+    columns = {name: each.reshape(len(each), -1) / feature_unit(name, units) for name, each in scalars.items()}
+    vectors = {name: _VECTORS[name](state) / feature_unit(name, units) for name in _VECTORS if name in names}
     return Features(
         scalars=torch.cat([*columns.values()], dim=1).float(),
         vectors=torch.cat([*vectors.values()], dim=1).float(),

@@ -31,17 +31,17 @@ class Units:
         time: Time between stored frames.
     """
 
-    length: float
-    density: float | Float[Tensor, "N 1"]
-    time: float
+    length: float | Float[Tensor, ""]
+    density: float | Float[Tensor, ""] | Float[Tensor, "N 1"]
+    time: float | Float[Tensor, ""]
 
     @property
-    def velocity(self) -> float:
+    def velocity(self) -> float | Tensor:
         """Spacings in a frame's time."""
         return self.length / self.time
 
     @property
-    def acceleration(self) -> float:
+    def acceleration(self) -> float | Tensor:
         """Spacings in a frame's time, squared."""
         return self.length / self.time**2
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from cconv.errors import ConfigError
 from cconv.nn.kinds import Kinds
 from cconv.tasks.features import CONSTANT, DENSITY, PARTICLE_TYPE, VELOCITY, WALLS
@@ -44,6 +46,6 @@ class PositionCorrection(StepTask):
                 "force of the scene"
             )
 
-    def unit(self, units: Units) -> float:
+    def unit(self, units: Units) -> float | Tensor:
         """A particle spacing."""
         return units.length

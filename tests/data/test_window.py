@@ -7,8 +7,8 @@ import torch
 from systems import periodic_frame, periodic_trajectory, window_of, with_walls
 
 from cconv.batching import index_of
-from cconv.data.window import Windows, join_windows, joinable, window_at
-from cconv.errors import DataError
+from cconv.data.window import Windows, join_windows, joinable, window_at, window_from_arrays
+from cconv.errors import DataError, ShapeError
 
 
 def test_windows_follow_each_other_frame_by_frame(generator):
@@ -100,3 +100,24 @@ def test_windows_with_other_frames_or_walls_are_not_joined(generator):
     with_solids = replace(third, particle_types=torch.ones_like(third.particle_types))
     others = [shorter, bare, without_normals, with_solids, replace(first, positions=first.positions.double())]
     assert joinable([first, *others]) == [[number] for number in range(6)]
+
+
+def test_arrays_of_another_program_are_the_window_that_the_data_set_gives(generator):
+    trajectory = periodic_trajectory(generator, num_frames=4)
+    stored = window_at(trajectory, present=3, history=3, future=0)
+    given = window_from_arrays(trajectory.positions[1:].numpy(), trajectory.masses.numpy())
+    for name in ("positions", "masses", "particle_types"):
+        assert torch.equal(getattr(given, name), getattr(stored, name))
+    assert given.is_fluid.all()
+
+
+def test_arrays_that_do_not_fit_are_refused(generator):
+    positions, masses = torch.rand(3, 5, 2, generator=generator), torch.ones(5)
+    for wrong, word in (
+        ((positions[0], masses), "frames, particles, dim"),
+        ((positions, masses[1:]), "masses"),
+        ((positions, masses, [0, 1]), "particle_types"),
+        ((positions / 0 * 0, masses), "finite"),
+    ):
+        with pytest.raises(ShapeError, match=word):
+            window_from_arrays(*wrong)

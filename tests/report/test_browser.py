@@ -9,7 +9,8 @@ import pytest
 from processes import PATIENCE
 from summaries import SAMPLE
 
-from cconv.report.comparison import compared_runs, write_comparison
+from cconv.report.compared_runs import compared_runs
+from cconv.report.comparison import write_comparison
 from cconv.report.page import render_report
 from cconv.study.records.run_folder import RunFolder
 

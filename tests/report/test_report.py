@@ -3,14 +3,12 @@
 import re
 import shutil
 
-import numpy as np
 import pytest
-from summaries import SAMPLE, changed, explanation, minimal_summary, relaxations, rollouts, whole_summary
+from summaries import SAMPLE, changed, minimal_summary, relaxations, whole_run_in
 
 from cconv.report import page
 from cconv.report.page import render_report, write_report
 from cconv.report.sections import SECTIONS, chart
-from cconv.study.records.rollouts import write_rollouts
 from cconv.study.records.run_folder import RunFolder
 
 pytestmark = pytest.mark.integration
@@ -27,14 +25,7 @@ def run(tmp_path):
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory):
     """A copy of the committed run with everything that a study may find."""
-    run = RunFolder(shutil.copytree(SAMPLE, tmp_path_factory.mktemp("whole") / "run"))
-    summary = whole_summary(run.summary())
-    run.write_summary(summary)
-    for name in summary.explained:
-        np.savez(run.path / "explanation" / f"{name}.npz", **explanation())
-    for name in summary.rolled:
-        write_rollouts(run, name, rollouts())
-    return run
+    return whole_run_in(tmp_path_factory.mktemp("whole"))
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cconv.data.importing.conversion import AXES
 from cconv.data.importing.particles import Particles
 from cconv.data.importing.runs import Run
 from cconv.data.importing.scan import RunScan
@@ -15,7 +16,6 @@ from cconv.data.trajectory import ParticleType
 from cconv.domain import Box
 from cconv.errors import ConfigError, DataError
 
-AXES = "xyz"
 GIVEN, IN_FILES = "given", "stored"  # where a value comes from
 SINGLY = "import frames singly with --separate-frames, for tasks that ask for fields of the present frame"
 
@@ -77,7 +77,8 @@ def frame_dt_of(runs: Sequence[Run], scans: Sequence[RunScan], settings: ImportS
             if scan.change is not None:
                 raise DataError(f"{scan.change.file}: {scan.change.text}; {SINGLY}.")
         if times is not None and len(times) > 1:
-            intervals.append(float(np.median(np.diff(times))))
+            unit = 1.0 if settings.name_time else settings.conversion.time
+            intervals.append(float(np.median(np.diff(times))) * unit)
     if settings.dt is not None:
         return settings.dt, GIVEN
     if intervals and intervals[0] > 0:

@@ -29,7 +29,7 @@ class Masses:
 
     @classmethod
     def of(cls, first: Particles, given: float | None, volume: float) -> "Masses":
-        """Decide by the first frame; `volume` is that of a particle at rest."""
+        """Decide by the first frame; `volume` is what a density in the units of the files becomes a mass by."""
         if given is not None:
             return cls(f"given: {given:g}", given, None, 1.0)
         if "mass" in first.values and (first.values["mass"] > 0).all():

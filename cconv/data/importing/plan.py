@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cconv.data.arrays import ParticleArrays, SceneFacts, split_runs, write_runs
-from cconv.data.importing.facts import AXES, GIVEN, IN_FILES, axes_of, box_of, frame_dt_of, on_axes, spacing_of
+from cconv.data.importing.conversion import AXES
+from cconv.data.importing.facts import GIVEN, IN_FILES, axes_of, box_of, frame_dt_of, on_axes, spacing_of
 from cconv.data.importing.masses import Masses
 from cconv.data.importing.runs import Run, find_runs
 from cconv.data.importing.scan import FrameReader, RunScan, count_of, scan_runs
@@ -71,12 +72,14 @@ def plan_import(
     reader = Reader(progress)
     runs = find_runs(patterns, phases, walls, reader)
     _check_enough(runs, settings)
-    frames = FrameReader(reader, settings.mapping, settings.types, settings.fluid)
+    frames = FrameReader(reader, settings.mapping, settings.types, settings.fluid, settings.conversion)
     scans = scan_runs(runs, frames, progress)
     axes = axes_of(scans)
     spacing, spacing_from = spacing_of(scans[0].first, axes, settings)
     frame_dt, dt_from = frame_dt_of(runs, scans, settings)
-    masses = Masses.of(scans[0].first, settings.mass, spacing ** len(axes))
+    in_files = settings.conversion  # densities are in the units of the files
+    volume = in_files.mass * (spacing / in_files.length) ** len(axes)
+    masses = Masses.of(scans[0].first, settings.mass, volume)
     walls_move = any(scan.walls_move for scan in scans)
     trajectories = ImportedTrajectories(runs, frames, axes, masses, settings.separate_frames, walls_move, frame_dt)
     _check_vectors(scans, axes, settings)
@@ -94,6 +97,7 @@ def plan_import(
         "time between frames": f"{frame_dt:.6g} ({dt_from})",
         "box": _box_text(scene.box, settings),
         "masses": masses.source,
+        "converted": settings.conversion.text or "nothing: units and axes are those of the files",
         "written as": trajectories.description,
     }
     return ImportPlan(found, missing, trajectories, trajectories.runs, scene, settings)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cconv.data.importing.conversion import Conversion
 from cconv.data.importing.fields import find_fields
 from cconv.data.importing.particles import Particles, Types, joined, particles_of
 from cconv.data.importing.runs import Run
@@ -25,12 +26,14 @@ class FrameReader:
         mapping: Names of fields that the user gave.
         types: Meaning of types that the user gave, or None.
         fluid: Number of fluid particles at the beginning of each file, or None.
+        conversion: Axes and units that particles are brought to.
     """
 
     reader: Reader
     mapping: Mapping[str, Sequence[str]]
     types: Types | None
     fluid: int | None
+    conversion: Conversion
 
     def fluid_of(self, run: Run, k: int) -> Particles:
         """Particles of the fluid's files, those of walls among them included."""
@@ -46,13 +49,13 @@ class FrameReader:
         return find_fields(self.reader.table(ref), self.mapping)
 
     def _fluid(self, ref: FrameRef) -> Particles:
-        return particles_of(self.reader.table(ref), self.fields(ref), self.types, self.fluid)
+        return self.conversion.of(particles_of(self.reader.table(ref), self.fields(ref), self.types, self.fluid))
 
     def _wall(self, ref: FrameRef) -> Particles:
         """Particles of a file that holds nothing but walls, whose names of fields may be the fluid's."""
         table = self.reader.table(ref)
         mapping = {field: names for field, names in self.mapping.items() if {*names} <= {*table.arrays}}
-        return particles_of(table, find_fields(table, mapping | {"type": ()}), None, None)
+        return self.conversion.of(particles_of(table, find_fields(table, mapping | {"type": ()}), None, None))
 
 
 @dataclass(frozen=True)

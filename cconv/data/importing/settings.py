@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass, field
 
+from cconv.data.importing.conversion import Conversion
 from cconv.data.importing.particles import Types
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
     """What a user says about the files; None and empty where they are to tell.
+
+    Lengths, times, masses and vectors are in the units and on the axes of the data set.
 
     Attributes:
         mapping: Names of the arrays of fields.
@@ -20,6 +23,7 @@ class ImportSettings:
         force: Constant external acceleration.
         bounds: Lower and upper bound of each axis.
         periodic: Letters of the periodic axes.
+        conversion: Axes and units of the data set.
         separate_frames: Whether each frame becomes a trajectory of its own.
         split_fractions: Shares of train, valid and test.
         gap: Frames dropped between the splits of a single run.
@@ -36,6 +40,7 @@ class ImportSettings:
     force: tuple[float, ...] | None = None
     bounds: tuple[tuple[float, float], ...] | None = None
     periodic: str = ""
+    conversion: Conversion = Conversion()
     separate_frames: bool = False
     split_fractions: tuple[float, ...] = (0.7, 0.15, 0.15)
     gap: int = 2

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -33,6 +33,7 @@ from cconv.validation import Length, Name, PathText, Real, Seed, StrictModel, Va
 
 _Component = Annotated[Real, Field(ge=-1e12, le=1e12)]
 _Size = Annotated[Whole, Field(ge=10, le=10**6)]  # particles
+Logger = Literal["mlflow", "wandb"]
 _Share = Annotated[Real, Field(ge=1e-6, le=1e6)]
 
 
@@ -156,6 +157,7 @@ class StudyConfig(StrictModel):
 
     Attributes:
         kinds: All kinds of stages that a study file can ask for.
+        log: Programs that evaluations of trainings are logged for, besides TensorBoard.
     """
 
     kinds: ClassVar[tuple[str, ...]] = ()
@@ -171,7 +173,13 @@ class StudyConfig(StrictModel):
     cost: CostConfig = CostConfig()
     selection: SelectionConfig = SelectionConfig()
     seeds: SeedsConfig = SeedsConfig()
+    log: tuple[Logger, ...] = ()
     stages: dict[Name, Stage]
+
+    @field_validator("log", mode="before")
+    @classmethod
+    def _logger_by_its_name(cls, log: object) -> object:
+        return (log,) if isinstance(log, str) else log
 
     @field_validator("task", mode="before")
     @classmethod

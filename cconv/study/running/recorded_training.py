@@ -80,6 +80,7 @@ def _trial(
         init_seed=job.init_seed,
         data_seed=study.seeds.data,
         provenance=provenance(study),
+        loggers=study.log,
     )
     yield from run_trial(
         problem,

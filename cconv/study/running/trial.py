@@ -1,7 +1,9 @@
 """One trial: a configuration is trained, evaluated and recorded, without Ray."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -10,8 +12,9 @@ from cconv.models.checkpoint import read_card, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import Configuration, TrainingConfig, configure
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.event_file import event_file
 from cconv.study.running.problem import Problem
+from cconv.study.running.training_log import Training
+from cconv.study.running.training_logs import TrainingLogs, training_logs
 from cconv.training.loop import Optimization, TrainingState, train
 from cconv.training.progress import Progress, begin, load_progress, save_progress
 from cconv.validation import Value
@@ -26,7 +29,8 @@ class Trial:
         parameters: Hyperparameters that replace those of the study.
         init_seed: Seed of the initial weights.
         data_seed: Seed of the batch order.
-        provenance: Origin of the data, for the card of the checkpoint.
+        provenance: Study and origin of the data, for the card of the checkpoint.
+        loggers: Names of programs that its evaluations are logged for, besides TensorBoard.
     """
 
     stage: str
@@ -34,6 +38,7 @@ class Trial:
     init_seed: int
     data_seed: int
     provenance: Mapping[str, Any]
+    loggers: Sequence[str] = ()
 
 
 def run_trial(
@@ -47,7 +52,7 @@ def run_trial(
 ) -> Iterator[dict]:
     """Train one configuration, or continue its training, and yield an entry at every evaluation.
 
-    Before an entry is yielded, everything is on disk: the log, the same for TensorBoard, the progress from which a
+    Before an entry is yielded, everything is on disk: the log, the same for other programs, the progress from which a
     killed training continues, and the checkpoint with the smallest validation error so far. On Ctrl-C before the first
     evaluation the checkpoint is the model at that moment. A loss that is not finite ends the trial with an entry whose
     ``diverged`` is true.
@@ -77,7 +82,7 @@ def run_trial(
         progress=progress,
     )
     try:
-        with event_file(folder.path, folder.log()) as events:
+        with _logs(trial, folder, config) as logs:
             for state in states:
                 on_update(state)
                 if state.valid_error is None and not state.diverged:
@@ -89,13 +94,26 @@ def run_trial(
                     best = error
                     save_model(state.model, folder.checkpoint, card | _spent(state) | {"valid_error": best})
                 folder.append(entry)
-                events.append(entry)
+                logs.append(entry)
                 save_progress(folder.progress, model, progress)
                 yield entry
     except KeyboardInterrupt:
         if not folder.checkpoint.exists():
             save_model(progress.average or model, folder.checkpoint, card | {"valid_error": None})
         raise
+
+
+def _logs(trial: Trial, folder: TrialFolder, config: Mapping) -> AbstractContextManager[TrainingLogs]:
+    """Logs of a training for other programs, with what its log holds already."""
+    log = folder.log()
+    training = Training(
+        folder=folder.path,
+        study=trial.provenance.get("study", folder.path.name),
+        stage=trial.stage,
+        settings=config,
+        begun=time.time() - (log[-1]["seconds"] if log else 0.0),
+    )
+    return training_logs(training, log, trial.loggers)
 
 
 def describe(problem: Problem, trial: Trial, model: Model, training: TrainingConfig) -> dict:

@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, chain
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -262,7 +262,7 @@ def _fit_and_record(
     configuration = configure(parameters, study.configuration)
     model = problem.build_model(configuration, 0)
     untrained = configuration.training.model_copy(update={"updates": 0})
-    seeds = {"init_seed": init_seed, "data_seed": study.seeds.data}
+    seeds: dict[str, Any] = {"init_seed": init_seed, "data_seed": study.seeds.data}
     trial = Trial(stage=stage, parameters=parameters, provenance=provenance(study), **seeds)
     config = describe(problem, trial, model, untrained) | {"closed_form": True, "ridge": ridge}
     folder.start(config)

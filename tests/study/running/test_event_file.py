@@ -11,7 +11,9 @@ from tensorboardX.record_writer import RecordWriter
 
 from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.records.trials import TrialFolder
-from cconv.study.running.event_file import EVENT_FILE, VERSION, event_file
+from cconv.study.running.event_file import EVENT_FILE, VERSION
+from cconv.study.running.training_log import Training
+from cconv.study.running.training_logs import training_logs
 from cconv.study.running.trial import Trial, run_trial
 
 TRAINING = TrainingConfig(updates=6, evaluate_every=2)
@@ -74,7 +76,8 @@ def test_a_training_that_goes_on_has_each_step_once(generator, tmp_path):
 
 
 def test_the_rate_is_that_between_two_evaluations_and_missing_values_are_left_out(tmp_path):
-    with event_file(tmp_path, [entry(4, seconds=2.0)]) as file:
+    training = Training(folder=tmp_path, study="s", stage="random", settings={}, begun=0.0)
+    with training_logs(training, [entry(4, seconds=2.0)]) as file:
         file.append(entry(10, seconds=3.0, valid_error=None, train_loss=None))
     assert scalars(tmp_path)[4]["updates_per_second"] == 2
     assert scalars(tmp_path)[10].keys() == {"learning_rate", "updates_per_second"}
@@ -84,7 +87,8 @@ def test_the_rate_is_that_between_two_evaluations_and_missing_values_are_left_ou
 def test_a_folder_where_nothing_can_be_written_stops_no_training(generator, tmp_path):
     folder = TrialFolder(tmp_path / "trial")
     (folder.path / EVENT_FILE).mkdir(parents=True)  # so that the file cannot be opened
-    assert [each["updates"] for each in train(generator, folder)] == [2, 4, 6]
+    with pytest.warns(UserWarning, match="no more is logged for TensorBoard"):
+        assert [each["updates"] for each in train(generator, folder)] == [2, 4, 6]
 
 
 def test_a_write_that_fails_ends_the_file_and_no_training(generator, tmp_path, monkeypatch):
@@ -92,4 +96,5 @@ def test_a_write_that_fails_ends_the_file_and_no_training(generator, tmp_path, m
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(RecordWriter, "write", fail)
-    assert [each["updates"] for each in train(generator, TrialFolder(tmp_path / "trial"))] == [2, 4, 6]
+    with pytest.warns(UserWarning, match="no more is logged for TensorBoard"):
+        assert [each["updates"] for each in train(generator, TrialFolder(tmp_path / "trial"))] == [2, 4, 6]
