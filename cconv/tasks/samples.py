@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -158,8 +158,18 @@ class WindowSamples(Sequence[StepSample]):
 
     @cached_property
     def spread(self) -> list[StepSample]:
-        """Samples of at most `MOST_SPREAD` windows, evenly spread, whose statistics stand for those of all."""
-        return list(self[:: math.ceil(len(self) / MOST_SPREAD)])
+        """Samples of at most `MOST_SPREAD` windows, evenly spread, whose statistics stand for those of all.
+
+        They hold frames of their own: sent to another process, a part of a trajectory would take all of it along.
+        """
+        return [_alone(sample) for sample in self[:: math.ceil(len(self) / MOST_SPREAD)]]
+
+
+def _alone(sample: StepSample) -> StepSample:
+    """A sample whose window shares no frames with others, and goes on for no more than the frame to learn."""
+    window = sample.window
+    own = replace(window, positions=window.positions.clone(), future=window.future[:1].clone())
+    return replace(sample, window=own)
 
 
 def learned_samples(dataset: Dataset, split: str, task: StepTask, further: int = 0) -> WindowSamples:

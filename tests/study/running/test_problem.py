@@ -1,5 +1,6 @@
 """What the trainings of a study share."""
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,6 +8,8 @@ import pytest
 import torch
 from systems import configured, periodic_frame, periodic_scene, problem, window_of
 
+from cconv.data.trajectory import Trajectory
+from cconv.data.window import Windows
 from cconv.errors import ConfigError
 from cconv.forces import ReversePoiseuilleForce
 from cconv.models.relaxation import Relaxation
@@ -145,3 +148,27 @@ def test_models_have_the_relaxation_of_their_configuration(generator):
     plain, relaxed = (given.build_model(of_history(6)._replace(relaxation=each), 0) for each in (None, relaxation))
     assert (plain.config.relaxation, relaxed.config.relaxation) == (None, relaxation)
     assert given.valid_error(relaxed) != given.valid_error(plain)
+
+
+def test_a_problem_of_steps_is_as_large_as_its_frames_when_it_is_sent(generator):
+    """Typical samples are parts of trajectories; each of them must not take its whole trajectory along."""
+
+    def sent(frames):
+        start = window_of(periodic_frame(generator), generator, future=1)
+        path = torch.cat([start.positions, start.future])
+        stored = Trajectory(
+            first_frame=0,
+            positions=path[torch.arange(frames) % len(path)],
+            velocities=torch.zeros(frames, *path.shape[1:]),
+            masses=start.masses,
+            particle_types=start.particle_types,
+            boundary=None,
+            name="long",
+        )
+        samples = WindowSamples(Windows([stored], 6, 1, further=20), periodic_scene(), task_named("acceleration"))
+        given = Problem(scene=samples.scene, task=samples.task, train_samples=samples, valid_samples=samples)
+        given.build_model(of_history(6), 0)
+        return len(pickle.dumps(given)), stored.positions.nbytes
+
+    (small, of_small), (large, of_large) = sent(206), sent(1006)  # 100 typical samples of each
+    assert large - small < 3 * (of_large - of_small)  # positions and velocities
