@@ -26,8 +26,10 @@ OLDEST_PYTHON, NEWEST_PYTHON = (3, 11), (3, 13)
 LEAST_DISK, LEAST_TEMPORARY, LEAST_MEMORY = 2e9, 1e9, 4e9  # bytes; a study of the published sizes needs as much
 EXTRAS = {  # packages that are not needed, and what they are for
     "e3nn": "the network SEGNN (pip install 'cconv[segnn]')",
+    "mlflow": "trainings as runs of MLflow (pip install 'cconv[mlflow]')",
     "open3d": "the comparison with Open3D's layers (pip install 'cconv[parity]')",
     "psycopg": "Optuna studies in PostgreSQL (pip install 'cconv[cluster]')",
+    "wandb": "trainings as runs of Weights & Biases (pip install 'cconv[wandb]')",
 }
 
 State = Literal["ok", "note", "warning", "problem"]

@@ -17,6 +17,7 @@ from cconv.errors import DataError
 from cconv.files import read_json
 
 COLLECTION, SERIES = ".pvd", ".series"  # files that name others
+PACKED = ".msgpack.zst"  # DeepLagrangianFluids, whose folders are read as they are
 SHARE = 4  # of the memory that data may take is for files that were read
 IRREGULAR = 0.01  # largest difference of two intervals that count as one, relative to them
 
@@ -194,6 +195,11 @@ def _matches(pattern: str) -> list[Path]:
             f"{one_line(pattern)}: no file matches; check the path, and quote patterns such as 'run/*.vtu'."
         )
     for file in files:
+        if file.name.endswith(PACKED):
+            raise DataError(
+                f"{file}: is of the DeepLagrangianFluids layout, whose folders need no import: cconv data inspect "
+                f"{file.parent} reads it."
+            )
         if file.suffix.lower() not in (*READERS, COLLECTION, SERIES):
             known = ", ".join((*READERS, COLLECTION, ".vtu.series"))
             raise DataError(f"{file}: has an ending that is not read; known are {known}: convert it, or leave it out.")

@@ -382,10 +382,11 @@ def test_a_wall_without_the_frame_of_the_fluid_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [("*.csv", "no file matches"), ("a.csv", "no file matches"), ("", "is a folder.*cconv data inspect"),
-     ("a.foam", "ending that is not read")],
+     ("a.foam", "ending that is not read"), ("a.msgpack.zst", "needs? no import: cconv data inspect")],
 )  # fmt: skip
 def test_patterns_that_name_nothing_to_read_are_refused(tmp_path, name, words):
     (tmp_path / "a.foam").touch()
+    (tmp_path / "a.msgpack.zst").touch()
     with pytest.raises(DataError, match=words):
         imported(tmp_path, [str(tmp_path / name)])
 
