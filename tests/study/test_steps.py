@@ -230,6 +230,8 @@ def test_a_study_without_a_search_trains_named_networks_for_equal_time(steps_fol
         if not found.ended:
             assert scores[name]["sinkhorn"] == pytest.approx(sum(found.sinkhorn) / len(found.sinkhorn))
     assert "Scoreboard" in (tmp_path / "page.html").read_text()
+    code, printed, _ = cconv("study", "compare", run.path)
+    assert (code, "Scoreboard" in printed, "CPU min" in printed) == (0, True, True)
 
 
 def test_a_space_whose_networks_look_back_less_far_than_the_predictor_is_refused(steps_folder, cconv, tmp_path):
