@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
+from cconv.report.compared_runs import ComparedRun, Inputs
 from cconv.study.records.found import (
     Ablation,
     AblationStep,
@@ -339,6 +340,27 @@ def _rolled(seed: str, trajectory: str, frames: int, ended: str) -> RolledTrajec
 def _flow(energy: float, looks: int) -> FlowSeries:
     shares = [0.25, 0.5, 0.25, 0.0]
     return FlowSeries(e_kin=[energy * 0.9**look for look in range(looks)], neighbors=shares, speeds=shares)
+
+
+def compared_steps(
+    folder: str = "runs/data/2D_TGV_2500_10kevery100", horizon: int = 20, ended: str = ""
+) -> ComparedRun:
+    """A study of steps with two finalists, of which the second errs three times as much and may end early."""
+    summary = RunFolder(SAMPLE).summary()
+    models = [
+        changed(finalist("large", error=3e-6), train_cpu_seconds=90.0),
+        finalist(summary.recommended.id, error=1e-6),
+    ]
+    with_five = [changed(each, test=changed(each.test, measures={"MSE5": each.test.error / 9})) for each in models]
+    summary = changed(
+        summary,
+        task=changed(summary.task, horizon=horizon),
+        dataset=changed(summary.dataset, path=folder),
+        finalists=with_five,
+        solver=solver_comparison(1e-8, 1e-5),
+        rolled=("large",),
+    )
+    return ComparedRun(label="s", summary=summary, inputs=Inputs(), rollouts={"large": rollouts(ended)})
 
 
 def seed_variance(updates: int) -> SeedVariance:

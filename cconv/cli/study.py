@@ -1,6 +1,5 @@
 """`cconv study`: run a study, continue it, add trials, show its state, compare several."""
 
-import json
 import math
 from operator import itemgetter
 from pathlib import Path
@@ -246,7 +245,7 @@ def compare(
         write_comparison(compared, out)
     if as_json:
         tables = {"answers": answers, "differences": differences, "scores": scores}
-        print_json({name: json.loads(table.to_json(orient="records")) for name, table in tables.items()})
+        print_json({name: _records(table) for name, table in tables.items()})
         return
     results.print(_answers_table(answers))
     for row in differences.itertuples():
@@ -256,6 +255,11 @@ def compare(
         results.print(_scores_table(str(data), rows))
     if out is not None:
         results.print(f"Page: {out}", soft_wrap=True)
+
+
+def _records(table: "pd.DataFrame") -> list[dict]:
+    """The rows of a table for JSON; what is not known is null."""
+    return table.astype(object).where(table.notna(), None).to_dict("records")
 
 
 def _answers_table(answers: "pd.DataFrame") -> Table:

@@ -46,7 +46,7 @@ def matrix(scores: pd.DataFrame) -> pd.DataFrame:
     same = scores.assign(network=scores["network"].where(scores["source"] == OURS, scores["network"] + ", published"))
     known = same[same["error"].notna()]
     wide = known.pivot_table(index="network", columns="data", values="error", aggfunc="min", sort=False)
-    return wide[wide.notna().sum(axis=1) > 1].reset_index()
+    return wide[wide.notna().sum(axis=1) > 1].reset_index().rename_axis(columns=None)
 
 
 def _of_study(run: ComparedRun) -> list[dict]:

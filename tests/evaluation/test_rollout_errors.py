@@ -84,6 +84,22 @@ def test_units_are_trajectories_or_single_rollouts(generator):
     assert table.measures["diverged rollouts"] == 0
 
 
+def test_mse5_is_the_mean_of_the_first_five_frames_where_there_are_five(generator):
+    class Pushed:
+        task = TASK
+
+        @staticmethod
+        def predict_frame(window, scene):
+            return TASK.target(window, scene) + 1e-3 * (window.frame >= 10)
+
+    windows = [window_of(periodic_frame(generator), generator, future=future) for future in (7, 4)]
+    long, short = ([each] for each in WindowSamples(windows, SCENE, TASK))
+    table = RolloutMSE().table(Pushed(), long, 1)
+    assert table.error == pytest.approx(2 / 7 * 1e-6, rel=1e-3)  # windows begin at frame 5
+    assert table.measures["MSE5"] == pytest.approx(0.0, abs=1e-12)
+    assert RolloutMSE().table(Pushed(), short, 1).measures["MSE5"] is None
+
+
 def test_the_mean_predictor_goes_on_with_the_mean_acceleration(generator):
     train, valid = begun(generator, 2), begun(generator, 2)
     mean = torch.cat([each.target * each.target_unit for each in train]).double().mean(dim=0)

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 from processes import PATIENCE
-from summaries import SAMPLE
+from summaries import SAMPLE, compared_steps
 
 from cconv.report.compared_runs import compared_runs
 from cconv.report.comparison import write_comparison
@@ -55,10 +55,13 @@ def seen(page, folder, width):
     return json.loads(re.search("<title>(.*?)</title>", printed, re.DOTALL)[1])
 
 
-@pytest.fixture(params=["report", "comparison"])
+@pytest.fixture(params=["report", "comparison", "scoreboard"])
 def page(request, tmp_path):
     if request.param == "report":
         return render_report(RunFolder(SAMPLE))
+    if request.param == "scoreboard":
+        write_comparison([compared_steps(), compared_steps("2D_RPF_3200", ended="diverged")], tmp_path / "scores.html")
+        return (tmp_path / "scores.html").read_text()
     shutil.copytree(SAMPLE, tmp_path / "copy")
     write_comparison(compared_runs([RunFolder(SAMPLE), RunFolder(tmp_path / "copy")]), tmp_path / "compared.html")
     return (tmp_path / "compared.html").read_text()

@@ -162,6 +162,78 @@ def test_a_study_fits_its_predictor_once_and_its_networks_correct_it(steps_folde
     assert [file.stat().st_mtime_ns for file in files] == fitted
 
 
+TIMED = """
+name = "timed"
+[task]
+name = "acceleration"
+history = 3
+horizon = 6
+[network]
+architecture = "radial_net"
+layers = 2
+first_channels = 2
+message = "mixed"
+radial_terms = 4
+[training]
+cpu_seconds = 0.2
+updates = 100000
+evaluate_every = 100000
+[search]
+space = "{space}"
+grace_updates = 100000
+[stages.finalists]
+include.small_gns = {{ network.architecture = "gns", network.layers = 1, network.hidden_channels = 8 }}
+[stages.select]
+[finalists]
+seeds = 1
+[cost]
+repeats = 3
+trials = 0
+sizes = [100]
+"""
+ONE_NETWORK = """
+name = "one"
+description = "A single network."
+[parameters.network.radial_terms]
+type = "choice"
+values = [4]
+baseline = 4
+reason = "Nothing is searched."
+"""
+
+
+def test_a_study_without_a_search_trains_named_networks_for_equal_time(steps_folder, cconv, tmp_path):
+    (tmp_path / "space.toml").write_text(ONE_NETWORK)
+    (tmp_path / "study.toml").write_text(TIMED.format(space=tmp_path / "space.toml"))
+    given = ("--serial", "--data", steps_folder, "--out", tmp_path / "run")
+    assert cconv("study", "run", tmp_path / "study.toml", *given)[0] == 0
+    run = RunFolder.open(tmp_path / "run")
+    trained = {entry.id: entry for entry in run.summary().finalists}
+    assert set(trained) == {"baseline", "small_gns"}
+    for name, entry in trained.items():
+        (record,) = run.retrainings()[name]
+        assert record.outcome == "completed"
+        assert 0.2 <= entry.train_cpu_seconds == record.log[-1]["cpu_seconds"]
+        assert entry.updates == record.log[-1]["updates"] < 100_000
+        assert 0 < record.log[-1]["learning_rate"] < 1e-3  # which falls with the share of the time that is spent
+        card = json.loads((run.path / entry.checkpoint / "card.json").read_text())
+        assert card["cpu_seconds"] == entry.train_cpu_seconds
+        assert entry.test.ci95 is None
+        assert entry.test.why_no_interval.startswith("1 training says too little of others")
+        assert entry.test.measures["MSE5"] <= entry.test.error
+    code, printed, _ = cconv("study", "compare", run.path, "--json", "--out", tmp_path / "page.html")
+    assert code == 0
+    scores = {row["model"]: row for row in json.loads(printed)["scores"]}
+    for name, entry in trained.items():
+        (found,) = read_rollouts(run, [name])[name].rolled
+        assert scores[name]["error"] == entry.test.error
+        if not found.ended:
+            assert scores[name]["sinkhorn"] == pytest.approx(sum(found.sinkhorn) / len(found.sinkhorn))
+    assert "Scoreboard" in (tmp_path / "page.html").read_text()
+    code, printed, _ = cconv("study", "compare", run.path)
+    assert (code, "Scoreboard" in printed, "CPU min" in printed) == (0, True, True)
+
+
 def test_a_space_whose_networks_look_back_less_far_than_the_predictor_is_refused(steps_folder, cconv, tmp_path):
     space = SMOKE.parents[1] / "search_spaces" / "rollout.toml"
     (tmp_path / "study.toml").write_text(CORRECTED.format(space=space))

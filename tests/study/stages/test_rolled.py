@@ -57,6 +57,11 @@ def test_every_training_is_rolled_out_and_the_first_one_kept(session, finalist):
     assert len(kept) == history + len(first.mse)
     apart = session.dataset.scene.box.displacement(kept[history:].double(), stored[history : len(kept)].double())
     assert np.allclose(first.mse, apart.square().mean(dim=(1, 2)), rtol=1e-3, atol=1e-12)
+    assert len(first.sinkhorn) == 4
+    assert all(value >= 0 for value in first.sinkhorn)
+    assert found.rolled[1].sinkhorn == ()  # one takes seconds
+    energies = zip(first.rollout.e_kin, first.reference.e_kin, strict=True)
+    assert first.e_kin_error == pytest.approx(np.mean([(ours - stored) ** 2 for ours, stored in energies]))
     assert animated(session.run.path / "rollouts" / "recommended").startswith("R0lGOD")
     assert rolled(session, finalist).rolled[0].mse == first.mse  # once more, as after an interruption
 
