@@ -15,7 +15,7 @@ from cconv.report.compared_runs import ComparedRun
 from cconv.report.page import templates
 from cconv.report.plots import new_figure
 from cconv.report.published import BUDGET
-from cconv.report.scoreboard import matrix, scores_table
+from cconv.report.scoreboard import OURS, matrix, scores_table
 from cconv.report.tables import speed_accuracy_table
 from cconv.study.records.summary import Summary
 
@@ -136,6 +136,7 @@ def write_comparison(runs: Sequence[ComparedRun], path: Path) -> None:
         chart=fronts_chart(runs),
         scenes={scene: rows.to_dict("records") for scene, rows in scores.groupby("data", sort=False)},
         matrix=matrix(scores),
+        has_published=bool((scores["source"] != OURS).any()),
         published_budget=BUDGET,
     )
     write_text(path, text)

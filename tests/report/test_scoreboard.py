@@ -89,3 +89,5 @@ def test_the_page_says_what_the_published_networks_were_trained_with(tmp_path):
     assert "500,000 updates on an A6000" in page
     assert "ends at 7 of 12" in page
     assert ">nan<" not in page
+    write_comparison([steps("elsewhere")], tmp_path / "own.html")
+    assert "A6000" not in (tmp_path / "own.html").read_text()
