@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from cconv.devices import moved
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.forces import Force
@@ -36,6 +37,10 @@ class Boundary:
     positions: Tensor
     normals: Tensor | None
     batch_index: Tensor | None = None
+
+    def to(self, device: torch.device) -> "Boundary":
+        """The same on a device."""
+        return moved(self, device, ("positions", "normals", "batch_index"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +89,15 @@ class Frame:
     masses: Tensor
     particle_types: Tensor
     boundary: Boundary | None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the particles are stored."""
+        return self.positions.device
+
+    def to(self, device: torch.device) -> "Frame":
+        """The same on a device."""
+        return moved(self, device, ("positions", "velocities", "masses", "particle_types", "boundary"))
 
 
 @dataclass(frozen=True, kw_only=True)

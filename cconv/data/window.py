@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cconv.batching import counts_of, groups_of, index_of
 from cconv.data.trajectory import Boundary, ParticleType, Trajectory
+from cconv.devices import moved
 from cconv.domain import Box
 from cconv.errors import DataError, ShapeError, check_shape
 
@@ -68,6 +69,16 @@ class Window:
     def is_fluid(self) -> Tensor:
         """Which particles a model moves, (N,), bool."""
         return self.particle_types == ParticleType.FLUID
+
+    @property
+    def device(self) -> torch.device:
+        """Where the particles are stored."""
+        return self.positions.device
+
+    def to(self, device: torch.device) -> "Window":
+        """The same on a device."""
+        names = ("positions", "future", "masses", "particle_types", "boundary", "batch_index")
+        return moved(self, device, names)
 
     def ending(self, history: int) -> "Window":
         """The same window without its oldest frames: at most `history` up to the present."""
@@ -151,7 +162,7 @@ def join_windows(windows: Sequence[Window]) -> Window:
         masses=torch.cat([window.masses for window in windows]),
         particle_types=torch.cat([window.particle_types for window in windows]),
         boundary=_joined_boundaries([window.boundary for window in windows if window.boundary is not None]),
-        batch_index=index_of([len(window.masses) for window in windows]),
+        batch_index=index_of([len(window.masses) for window in windows], first.device),
         joined=tuple(origin for window in windows for origin in window.origins),
     )
 
@@ -175,7 +186,7 @@ def _joined_boundaries(boundaries: Sequence[Boundary]) -> Boundary | None:
     return Boundary(
         positions=torch.cat([boundary.positions for boundary in boundaries]),
         normals=torch.cat(normals) if normals else None,
-        batch_index=index_of([len(boundary.positions) for boundary in boundaries]),
+        batch_index=index_of([len(each.positions) for each in boundaries], boundaries[0].positions.device),
     )
 
 

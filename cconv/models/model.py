@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from cconv.data.trajectory import Frame, ParticleType, Scene
 from cconv.data.window import Window
+from cconv.devices import home_of
 from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.relaxation import Relaxation
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
@@ -194,6 +195,16 @@ class Model(nn.Module):
         return model
 
     @property
+    def device(self) -> torch.device:
+        """Where the network computes."""
+        return self.target_mean.device
+
+    @property
+    def home(self) -> torch.device:
+        """Where the states of particles best stand: where the network computes, or the CPU if it needs float64."""
+        return home_of(self.device)
+
+    @property
     def num_parameters(self) -> int:
         """Number of learned values."""
         return sum(parameter.numel() for parameter in self.parameters())
@@ -219,6 +230,7 @@ class Model(nn.Module):
             ShapeError: If the frame has another dimension or other walls than the model.
         """
         self._check(inputs)
+        inputs = inputs.read_on(self.device)
         cutoff = self.settings.relative_cutoff
         points, index = inputs.positions, inputs.batch_index
         searches = [
@@ -248,6 +260,7 @@ class Model(nn.Module):
 
     def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "M C"]:
         """Standardised prediction (M, C) for the particles that are asked about."""
+        inputs = inputs.read_on(self.device)
         values = self.network(*self.network_inputs(inputs, geometry))
         return values if inputs.answered is None else values[inputs.answered]
 
@@ -267,7 +280,7 @@ class Model(nn.Module):
 
     def standardize_target(self, target: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """Target (N, C) in a sample's units to standardised values."""
-        return (target - self.target_mean) / self.target_scale
+        return (target.to(self.device) - self.target_mean) / self.target_scale
 
     @torch.no_grad()
     def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_answers} C"]:
@@ -276,12 +289,13 @@ class Model(nn.Module):
 
     def in_units_of_data(self, prediction: Float[Tensor, "M C"], inputs: Inputs) -> Float[Tensor, "M C"]:
         """Convert a standardised prediction (M, C) to the units of the data, and add what a predictor has answered."""
-        answer = (prediction * self.target_scale + self.target_mean) * self.task.unit(inputs.units)
+        standing = (prediction * self.target_scale + self.target_mean).to(inputs.positions.device)
+        answer = standing * self.task.unit(inputs.units)
         return answer if inputs.known is None else answer + inputs.known
 
     @torch.no_grad()
     def predict_frame(self, frame: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
-        """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data.
+        """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data, where that is.
 
         Args:
             frame: A frame for a model of a field, a window up to the present frame for a model of a step.
@@ -291,7 +305,7 @@ class Model(nn.Module):
 
     def answer(self, observed: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
         """`predict_frame`, differentiable."""
-        return self._answer(self.inputs(observed, scene))
+        return self._answer(self.inputs(observed.to(self.home), scene)).to(observed.device)
 
     def _answer(self, inputs: Inputs) -> Float[Tensor, "M C"]:
         return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)

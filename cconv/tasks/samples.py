@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from cconv.batching import groups_of
 from cconv.data.dataset import Dataset
 from cconv.data.trajectory import Frame, Scene
 from cconv.data.window import Origin, Window, Windows
+from cconv.devices import moved
 from cconv.errors import check_choice
 from cconv.tasks.features import make_inputs
 from cconv.tasks.inputs import Inputs, join_inputs
@@ -48,6 +49,10 @@ class Sample:
         """Where the frame comes from, or each of several."""
         return self.joined or (Origin(self.trajectory, self.frame),)
 
+    def to(self, device: torch.device) -> Self:
+        """The same on a device."""
+        return moved(self, device, ("inputs", "target", "target_unit"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class StepSample(Sample):
@@ -62,6 +67,10 @@ class StepSample(Sample):
     window: Window
     scene: Scene
     task: StepTask
+
+    def to(self, device: torch.device) -> Self:
+        """The same on a device."""
+        return moved(super().to(device), device, ("window",))
 
 
 def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "", index: int = 0) -> Sample:

@@ -27,7 +27,7 @@ class ModelPredictor:
     """
 
     def __init__(self, model: Model):
-        self._model, self._exact = model, deepcopy(model).double()
+        self._model, self._exact = model, deepcopy(model).to(model.home).double()
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
         """Field (N, C) in the units of the data, as `Model.predict_frame`."""
