@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -49,7 +49,7 @@ class Sample:
         """Where the frame comes from, or each of several."""
         return self.joined or (Origin(self.trajectory, self.frame),)
 
-    def to(self, device: torch.device) -> Self:
+    def to(self, device: torch.device) -> "Sample":
         """The same on a device."""
         return moved(self, device, ("inputs", "target", "target_unit"))
 
@@ -68,9 +68,9 @@ class StepSample(Sample):
     scene: Scene
     task: StepTask
 
-    def to(self, device: torch.device) -> Self:
+    def to(self, device: torch.device) -> "StepSample":
         """The same on a device."""
-        return moved(super().to(device), device, ("window",))
+        return moved(self, device, ("inputs", "target", "target_unit", "window"))
 
 
 def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "", index: int = 0) -> Sample:
