@@ -8,6 +8,7 @@ derivatives of features that several blocks read.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -237,8 +238,7 @@ class _ByBlocks(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: _Call, *tensors: Tensor) -> Tensor:
         ctx.save_for_backward(*tensors)
-        kind = tensors[0].device.type
-        ctx.call, ctx.autocast = call, (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
+        ctx.call, ctx.precision = call, _precision_on(tensors[0].device)
         output = tensors[0].new_zeros(len(call.graph.row_splits) - 1, call.outputs)
         for block in call.graph.blocks(call.values):
             output[block.rows] = call.run(block, call.of_block(block, tensors))
@@ -247,11 +247,18 @@ class _ByBlocks(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         call, tensors, needed = ctx.call, ctx.saved_tensors, ctx.needs_input_grad[1:]
-        kind, dtype, enabled = ctx.autocast
-        with torch.autocast(kind, dtype=dtype, enabled=enabled):
+        with ctx.precision():
             if torch.is_grad_enabled():  # the derivative is to be differentiated again
                 return None, *_derived(call.again(*call.sorted(tensors)), tensors, needed, gradient, True)
             return None, *_summed_over_blocks(call, tensors, needed, gradient)
+
+
+def _precision_on(device: torch.device) -> Callable[[], AbstractContextManager]:
+    """What sets the precision of products to that of now, in the backward pass, where torch's autocast has ended."""
+    kind = device.type
+    if not (torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)):
+        return nullcontext
+    return partial(torch.autocast, kind, dtype=torch.get_autocast_dtype(kind))
 
 
 def _derived(
