@@ -1,9 +1,11 @@
 """Devices: which one a wish means on this machine, where the states of particles stand, and when its work is done."""
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import torch
 
@@ -12,6 +14,10 @@ from cconv.errors import ConfigError, shown
 AUTO, CPU = "auto", torch.device("cpu")
 WISH = re.compile(r"auto|cpu|mps|cuda(:\d{1,3})?")
 WISHES = "auto, cpu, cuda, cuda:N or mps"
+FLOAT32: Final = "float32"
+TF32: Final = "tf32"
+BFLOAT16: Final = "bfloat16"
+Precision = Literal["float32", "tf32", "bfloat16"]  # of products of matrices
 
 Record = TypeVar("Record")
 
@@ -71,6 +77,47 @@ def wait_for(device: torch.device) -> None:
         torch.cuda.synchronize(device)
     elif device.type == "mps":
         torch.mps.synchronize()
+
+
+@contextmanager
+def products_in(precision: Precision, device: torch.device) -> Iterator[None]:
+    """Compute products of float32 matrices in another precision; sums and everything of float64 stay as they are.
+
+    Args:
+        precision: "float32"; "tf32", whose products keep 10 bits of a mantissa on NVIDIA GPUs and are as in float32
+            elsewhere; "bfloat16", whose operands and results have 7 bits.
+        device: Where they are computed.
+    """
+    if precision == BFLOAT16:
+        with torch.autocast(device.type, torch.bfloat16):
+            yield
+    elif precision == TF32 and device.type == "cuda":
+        with _tf32():
+            yield
+    else:
+        yield
+
+
+@contextmanager
+def _tf32() -> Iterator[None]:
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = True
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before
+
+
+@contextmanager
+def repeatable(wanted: bool) -> Iterator[None]:
+    """Have GPUs give the same bits every time, if wanted, at some loss of speed; the CPU does so anyway."""
+    before = torch.are_deterministic_algorithms_enabled()
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which deterministic products ask for
+    torch.use_deterministic_algorithms(wanted or before)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
 
 
 def moved(record: Record, device: torch.device, names: Sequence[str]) -> Record:

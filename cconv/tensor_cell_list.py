@@ -86,7 +86,8 @@ def pairs_by_receiver(
     """
     axes = _axes(receivers, cutoff, lengths, 0 if windows is None else _highest(windows))
     places, cells = (
-        [axis.cells(along) for axis, along in zip(axes, points.unbind(1), strict=True)] for points in (receivers, senders)
+        [axis.cells(along) for axis, along in zip(axes, points.unbind(1), strict=True)]
+        for points in (receivers, senders)
     )
     first = [None, None] if windows is None else list(windows)
     numbers, order = _numbers(axes, cells, first[1]).sort(stable=True)

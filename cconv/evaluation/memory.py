@@ -1,5 +1,6 @@
 """Memory of a prediction, measured in a separate process for each model."""
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -57,6 +58,19 @@ def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame | Wind
     for _ in range(2):
         model.predict_frame(frame, scene)
     sender.send(peak_resident_megabytes() - before)
+
+
+def device_megabytes(model: Model, frame: Frame | Window, scene: Scene) -> float:
+    """Measure how much a prediction adds to what torch holds on an NVIDIA GPU, MB; NaN on devices that do not tell."""
+    if model.device.type != "cuda":
+        return math.nan
+    placed = frame.to(model.home)
+    torch.cuda.synchronize(model.device)
+    torch.cuda.reset_peak_memory_stats(model.device)
+    before = torch.cuda.memory_allocated(model.device)
+    model.predict_frame(placed, scene)
+    torch.cuda.synchronize(model.device)
+    return (torch.cuda.max_memory_allocated(model.device) - before) / 2**20
 
 
 def peak_resident_megabytes() -> float:

@@ -48,7 +48,7 @@ def save_model(model: Model, folder: Path | str, card: dict) -> None:
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     try:
-        save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
+        save_file({name: tensor.cpu().contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
         (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **model.config.model_dump(mode="json")}, indent=2))
         (fresh / CARD).write_text(json.dumps(card, indent=2, allow_nan=False))
         if not folder.exists():

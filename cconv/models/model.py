@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from cconv.data.trajectory import Frame, ParticleType, Scene
 from cconv.data.window import Window
-from cconv.devices import home_of
+from cconv.devices import FLOAT32, Precision, home_of, products_in
 from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.relaxation import Relaxation
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
@@ -44,7 +44,7 @@ class ModelConfig(StrictModel):
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     `wall_types` are the types of the training data's wall particles, values of `ParticleType`, for a step task.
     `relaxation` is what rollouts of a step apply after every frame. `force_travel` is that of a step task to which the
-    integrator adds the external force, in particle spacings.
+    integrator adds the external force, in particle spacings. `precision` is that of the network's matrix products.
     """
 
     task: str
@@ -62,6 +62,7 @@ class ModelConfig(StrictModel):
     predictor: "ModelConfig | None" = None
     relaxation: Relaxation | None = None
     force_travel: Annotated[Real, Field(ge=0, le=1e6)] | None = None
+    precision: Precision = FLOAT32
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -261,7 +262,8 @@ class Model(nn.Module):
     def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "M C"]:
         """Standardised prediction (M, C) for the particles that are asked about."""
         inputs = inputs.read_on(self.device)
-        values = self.network(*self.network_inputs(inputs, geometry))
+        with products_in(self.config.precision, self.device):
+            values = self.network(*self.network_inputs(inputs, geometry)).to(self.target_mean.dtype)
         return values if inputs.answered is None else values[inputs.answered]
 
     def network_inputs(
@@ -354,6 +356,7 @@ def build_model(
     scene: Scene,
     train_samples: Sequence[Sample],
     generator: torch.Generator | None = None,
+    precision: Precision = FLOAT32,
 ) -> Model:
     """A fresh model for a scene, standardised by its training samples only.
 
@@ -364,6 +367,7 @@ def build_model(
         scene: Scene of the samples.
         train_samples: Training split.
         generator: Source of the initial weights; None for torch's global one.
+        precision: That of the network's matrix products: "float32", "tf32" or "bfloat16".
 
     Raises:
         ConfigError: If the network would be too large, or a feature is unknown or missing.
@@ -388,6 +392,7 @@ def build_model(
         wall_types=_wall_types(train_samples[0]),
         network=network,
         predictor=None if predictor is None else predictor.config,
+        precision=precision,
     )
     # Shifted vectors would break the rotation equivariance of the network.
     turns = network.is_equivariant

@@ -315,7 +315,7 @@ class RadialConv(nn.Module):
             return join_kinds(scalars, (components @ filters[1].flatten(0, 1)).transpose(1, 2))
 
         def again(features: Tensor, per_edge: Sequence[Tensor], filters: Sequence[Tensor]) -> Tensor:
-            return self._convolve_generally(features, *filters, geometry)
+            return self._convolve_generally(features, filters[0], filters[1], geometry)
 
         return by_blocks(
             compute,

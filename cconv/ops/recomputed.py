@@ -2,7 +2,7 @@
 
 What the edges of a block read is a small dense product for each receiver: with the weights S (P, K^D) that its up to P
 edges read the filter cells with, and their messages F (P, C), the columns of a receiver are Sᵀ F. Its products with the
-filters are those of a whole block. Nothing of a block is kept: the backward pass computes it again, and derives it then.
+filters are those of a whole block. Nothing of a block is kept: the backward pass computes it again, and derives it.
 So everything can be differentiated, positions too, and each value is written once, without atomics, but for the
 derivatives of features that several blocks read.
 """
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from cconv.ops.filter_reads import FilterReads, corners
 _BLOCK_VALUES = 2**25  # numbers that the columns of a block and what they are made of hold at most
 _WIDTH = 64  # edges of a receiver that one product takes at most; those with more take several
 
+T = TypeVar("T")
 Compute = Callable[["Block", Tensor, Tensor, Sequence[Tensor], Sequence[Tensor]], Tensor]
 
 
@@ -61,7 +62,7 @@ class Block:
             number = torch.zeros_like(row).index_put((some,), torch.arange(len(some), device=row.device))
             places = number[receiver[chosen]] * _WIDTH + place[chosen] - first
             part = _columns(messages[chosen], stencil.of(chosen), places, (len(some), _WIDTH))
-            gathered = gathered.index_add(0, some, part)
+            gathered = gathered.index_add(0, some, part.to(gathered.dtype))
         return gathered
 
 
@@ -100,12 +101,18 @@ def _columns(messages: Tensor, stencil: Stencil, places: Tensor, shape: tuple[in
     weights = torch.stack([weight for _, weight in read_cells], dim=1).flatten()
     dense = weights.new_zeros(rows * width * stencil.num_cells).scatter_add(0, read, weights)
     sent = messages.new_zeros(rows * width, messages.shape[1]).index_copy(0, places, messages)
-    return torch.bmm(dense.view(rows, width, stencil.num_cells).transpose(1, 2), sent.view(rows, width, messages.shape[1]))
+    return torch.bmm(
+        dense.view(rows, width, stencil.num_cells).transpose(1, 2), sent.view(rows, width, messages.shape[1])
+    )
 
 
 def applies(values: Tensor) -> bool:
-    """Tell whether blocks are the path of these values: on every device but the CPU, unless a graph is compiled."""
-    return values.device.type != "cpu" and not torch.compiler.is_compiling()
+    """Tell whether blocks are the path of these values: where compiled loops know device or precision of products not.
+
+    A graph that is compiled can hold neither.
+    """
+    on_cpu = values.device.type == "cpu"
+    return not torch.compiler.is_compiling() and (not on_cpu or torch.is_autocast_enabled("cpu"))
 
 
 def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:
@@ -225,7 +232,7 @@ class _Call:
         sent = features[self.graph.senders[block.edges]]
         return [sent, received, *(each[block.edges] for each in per_edge), *shared]
 
-    def sorted(self, tensors: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor], Sequence[Tensor]]:
+    def sorted(self, tensors: Sequence[T]) -> tuple[T, Sequence[T], Sequence[T]]:
         """Features, values of edges, shared values."""
         return tensors[0], tensors[1 : 1 + self.num_per_edge], tensors[1 + self.num_per_edge :]
 
@@ -275,13 +282,16 @@ def _derived(
 def _summed_over_blocks(
     call: _Call, tensors: Sequence[Tensor], needed: Sequence[bool], gradient: Tensor
 ) -> list[Tensor | None]:
-    derivatives = [torch.zeros_like(each) if is_needed else None for each, is_needed in zip(tensors, needed, strict=True)]
+    derivatives = [
+        torch.zeros_like(each) if is_needed else None for each, is_needed in zip(tensors, needed, strict=True)
+    ]
     of_features, of_edges, of_shared = call.sorted(derivatives)
     needs = [needed[0], needed[0] and call.graph.one_set, *needed[1:]]
     for block in call.graph.blocks(call.values):
         with torch.enable_grad():
             read = [
-                each.detach().requires_grad_(need) for each, need in zip(call.of_block(block, tensors), needs, strict=True)
+                each.detach().requires_grad_(need)
+                for each, need in zip(call.of_block(block, tensors), needs, strict=True)
             ]
             output = call.run(block, read)
         sent, received, *others = _derived(output, read, needs, gradient[block.rows])

@@ -212,7 +212,7 @@ class Inputs:
         return moved(self.read_on(device), device, ("units", "known"))
 
     def read_on(self, device: torch.device) -> "Inputs":
-        """What a network reads on a device; units and the answer of a predictor, for which it may lack float64, stay."""
+        """What a network reads on a device; units and a predictor's answer, for which it may lack float64, stay."""
         points = ("positions", "features", "wall_positions", "wall_features")
         return moved(self, device, (*points, "answered", "batch_index", "wall_batch_index"))
 
@@ -232,7 +232,11 @@ class Inputs:
             return [self]
         counts = counts_of(self.batch_index)
         walls = self._separated_walls(len(counts))
-        densities = torch.as_tensor(self.units.density, device=self.positions.device).expand(self.num_particles, 1).split(counts)
+        densities = (
+            torch.as_tensor(self.units.density, device=self.positions.device)
+            .expand(self.num_particles, 1)
+            .split(counts)
+        )
         answered = [None] * len(counts) if self.answered is None else self.answered.split(counts)
         known = [None] * len(counts) if self.known is None else self.known.split(self.answer_counts)
         parts = zip(

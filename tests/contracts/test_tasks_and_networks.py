@@ -183,4 +183,6 @@ def gradients(model, observed, scene):
     """Gradients of a loss by the names of the parameters."""
     model.zero_grad()
     model.answer(observed, scene).square().sum().backward()
-    return {name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None and each.numel()}
+    return {
+        name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None and each.numel()
+    }

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -73,7 +74,9 @@ def one_graph(task, frames, steps=1):
         model = type("Takes", (), {"config": type("Config", (), {"features": task.features})})
         (joined,) = StoredExamples(WindowSamples(frames, SCENE, task)).draw(range(len(frames)), 1, model, steps)
     else:
-        (joined,) = StoredExamples(samples_of(task, frames)).draw(range(len(frames)), 1, None)
+        (joined,) = StoredExamples(samples_of(task, frames)).draw(
+            range(len(frames)), 1, SimpleNamespace(home=torch.device("cpu"))
+        )
     return joined
 
 

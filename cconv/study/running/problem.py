@@ -12,6 +12,7 @@ from cconv.data.metadata import OVERRIDES
 from cconv.data.smoothed_force import travel_deviation
 from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
+from cconv.devices import find_device
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.closed_form import solve_closed_form
@@ -158,6 +159,7 @@ class Problem:
             self.scene,
             self._typical(task),
             torch.Generator().manual_seed(init_seed),
+            configuration.training.precision,
         )
         return model if configuration.relaxation is None else model.relaxed_by(configuration.relaxation)
 
@@ -191,6 +193,25 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
     """
     check_setting(PathText, path, "--data")
     return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
+
+
+def with_device(study: StudyConfig, wish: str) -> StudyConfig:
+    """Return the study with another wish for a device.
+
+    Raises:
+        ConfigError: If this machine does not have it.
+    """
+    find_device(wish)
+    return study.model_copy(update={"training": study.training.model_copy(update={"device": wish})})
+
+
+def device_of(study: StudyConfig) -> torch.device:
+    """Find the device of a study on this machine.
+
+    Raises:
+        ConfigError: If this machine does not have it.
+    """
+    return find_device(study.training.device, "training.device")
 
 
 def study_samples(

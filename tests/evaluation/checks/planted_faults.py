@@ -29,6 +29,8 @@ class Analytic:
     def predict(self, frame, scene):
         return self.field(self.state(frame, scene, self.dtype), frame, scene)
 
+    precision = "float32"
+
     def predict_exactly(self, frame, scene):
         return self.field(self.state(frame, scene, torch.float64), frame, scene)
 
