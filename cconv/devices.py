@@ -124,4 +124,6 @@ def moved(record: Record, device: torch.device, names: Sequence[str]) -> Record:
     """A dataclass whose fields of some names, which are tensors, know `to` themselves or are None, are on a device."""
     values = {name: getattr(record, name) for name in names}
     changes: dict[str, Any] = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
+    if all(changes[name] is values[name] for name in changes):
+        return record
     return replace(record, **changes)  # type: ignore[type-var]

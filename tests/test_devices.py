@@ -83,6 +83,14 @@ def test_a_missing_device_ends_commands_on_checkpoints_in_one_line(command, ccon
     assert_one_clear_line(cconv(command, tmp_path, "--device", "cuda"), "cuda", "take cpu or auto")
 
 
+def test_a_device_without_memory_is_one_line(cconv, monkeypatch, tmp_path):
+    def load(*given, **options):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has 1 GiB free.")
+
+    monkeypatch.setattr("cconv.models.checkpoint.load_model", load)
+    assert_one_clear_line(cconv("evaluate", tmp_path), "CUDA out of memory", "--device cpu")
+
+
 def train_on(monkeypatch, given, folder, device, network):
     """Train a few updates, as a study does, with noise and pushforward where windows allow it."""
     monkeypatch.setattr(trials, "find_device", lambda wish, name: torch.device(device))
@@ -125,7 +133,8 @@ def test_a_rollout_stays_on_the_device(generator):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
-def test_the_cost_names_the_device_and_frames_stand_there(generator, tmp_path):
+def test_the_cost_names_the_device_and_frames_stand_there(generator, monkeypatch, tmp_path):
+    monkeypatch.setattr("cconv.evaluation.cost.peak_megabytes", lambda load, models, *rest: dict.fromkeys(models, 1.0))
     given = problem(generator)
     save_model(given.build_model(configured(layers=1, kernel_size=3), 0), tmp_path / "model", {})
     frames = [periodic_frame(generator)]

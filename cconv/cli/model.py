@@ -179,9 +179,9 @@ def evaluate(
     rolled = horizon or card.get("horizon") or HORIZON
     windows = replace(model.task, history=card.get("window") or model.task.history)  # as its study compared models
 
-    def samples(split: str, verb: str) -> list:
+    def samples(split: str, verb: str) -> Sequence:
         label = f"{verb} {split}"
-        return list(show_progress(compared_samples(dataset, split, windows, rolled), label))
+        return compared_samples(dataset, split, windows, rolled, lambda numbers: show_progress(numbers, label))
 
     asked, objective = samples(split, "read"), objective_of(model.task)
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None

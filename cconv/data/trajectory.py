@@ -1,7 +1,7 @@
 """The data that readers return: a scene, its trajectories, their frames."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Protocol
 
@@ -139,6 +139,12 @@ class Trajectory:
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
 
+    def between(self, start: int, stop: int) -> "Trajectory":
+        """Some of the frames, from `start` up to `stop`, counted from the first one here; memory is shared."""
+        frames = slice(start, stop)
+        first = self.first_frame + start
+        return replace(self, first_frame=first, positions=self.positions[frames], velocities=self.velocities[frames])
+
 
 class Frames(Protocol):
     """Consecutive frames of one simulation, in memory as a `Trajectory` or read when they are asked for.
@@ -165,6 +171,8 @@ class Frames(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+    def between(self, start: int, stop: int) -> Trajectory: ...
 
 
 def time_of(trajectory: Frames, index: int, frame_dt: float) -> float:

@@ -68,7 +68,7 @@ class Cost:
     flops_per_particle: float
     threads: int
     num_particles: float
-    device: str
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,10 +151,10 @@ def _peaks(
     scene: Scene,
     threads: int,
 ) -> dict[str, float]:
-    """Memory that a prediction of each model adds: to a fresh process on the CPU, on a GPU to what it holds already."""
-    if all(model.device.type == "cpu" for model in loaded.values()):
-        return peak_megabytes(load, models, frame, scene, threads)
-    return {name: device_megabytes(model, frame, scene) for name, model in loaded.items()}
+    """Memory that a prediction of each model adds: on an NVIDIA GPU to what it holds already, else to a fresh process."""
+    if all(model.device.type == "cuda" for model in loaded.values()):
+        return {name: device_megabytes(model, frame, scene) for name, model in loaded.items()}
+    return peak_megabytes(load, models, frame, scene, threads)
 
 
 @dataclass(frozen=True, kw_only=True)

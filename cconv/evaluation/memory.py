@@ -1,6 +1,5 @@
 """Memory of a prediction, measured in a separate process for each model."""
 
-import math
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -61,9 +60,7 @@ def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame | Wind
 
 
 def device_megabytes(model: Model, frame: Frame | Window, scene: Scene) -> float:
-    """Measure how much a prediction adds to what torch holds on an NVIDIA GPU, MB; NaN on devices that do not tell."""
-    if model.device.type != "cuda":
-        return math.nan
+    """Measure how much a prediction adds to what torch holds on an NVIDIA GPU, MB."""
     placed = frame.to(model.home)
     torch.cuda.synchronize(model.device)
     torch.cuda.reset_peak_memory_stats(model.device)

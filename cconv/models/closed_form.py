@@ -14,7 +14,7 @@ from cconv.networks import RadialNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.tasks import task_named
 from cconv.tasks.inputs import Inputs
-from cconv.tasks.samples import Sample, iterate_samples
+from cconv.tasks.samples import FrameSamples, Sample
 from cconv.tasks.task import as_field
 
 
@@ -88,7 +88,7 @@ def fit_closed_form(
     if network is None:
         reach = asked.kernel_at(1.0, dataset.scene.dim).support_radius
         network = RadialNetSettings(layers=1, message="difference", relative_cutoff=reach)
-    samples = list(iterate_samples(dataset, "train", asked))
+    samples = FrameSamples(dataset, "train", asked)
     model = build_model(network, asked, asked.features if features is None else features, dataset.scene, samples)
     solve_closed_form(model, samples, ridge, progress)
     return model.eval()

@@ -396,7 +396,7 @@ def build_model(
     )
     # Shifted vectors would break the rotation equivariance of the network.
     turns = network.is_equivariant
-    taken = [sample.inputs.features.select(config.fluid_features) for sample in train_samples]
+    taken = (sample.inputs.features.select(config.fluid_features) for sample in train_samples)
     center = network.has_intercept(config.output) and not (turns and config.output.vectors)
     targets = standardize_values((sample.target for sample in train_samples), center)
     standardization = standardize_features(taken, center_vectors=not turns)

@@ -73,7 +73,7 @@ def test_only_steps_can_be_rolled_out(generator):
 
 def test_units_are_trajectories_or_single_rollouts(generator):
     class Replay:
-        task = TASK
+        task, home = TASK, torch.device("cpu")
         predict_frame = staticmethod(TASK.target)
 
     alone = begun(generator, 3)

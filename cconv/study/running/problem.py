@@ -24,10 +24,10 @@ from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import features_in
 from cconv.tasks.samples import (
     HORIZON,
+    FrameSamples,
     Sample,
     StepSample,
     WindowSamples,
-    iterate_samples,
     learned_samples,
     rolled_samples,
 )
@@ -227,7 +227,7 @@ def study_samples(
         progress: Wraps an iterable to show progress, given a label.
     """
     if not isinstance(task, StepTask):
-        return list(progress(iterate_samples(dataset, split, as_field(task)), split))
+        return FrameSamples(dataset, split, as_field(task), progress=lambda numbers: progress(numbers, split))
     if split == "train":
         return learned_samples(dataset, split, task, further=MOST_PUSHED)
     return rolled_samples(dataset, split, task, _horizon(study))

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
+from cconv.data.stored_frames import StoredFrames
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
@@ -244,7 +245,9 @@ def _timed_frames(session: Session) -> list[Any]:
     samples = session.problem.valid_samples
     if isinstance(samples, WindowSamples):
         return list(samples.windows[:TIMED_FRAMES])
-    return list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
+    dataset = session.dataset
+    stored = (StoredFrames(dataset, "valid", k) for k in range(len(dataset.splits["valid"])))
+    return list(islice((each[index] for each in stored for index in range(len(each))), TIMED_FRAMES))
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
