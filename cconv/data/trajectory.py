@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -146,6 +146,7 @@ class Trajectory:
         return replace(self, first_frame=first, positions=self.positions[frames], velocities=self.velocities[frames])
 
 
+@runtime_checkable
 class Frames(Protocol):
     """Consecutive frames of one simulation, in memory as a `Trajectory` or read when they are asked for.
 
