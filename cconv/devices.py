@@ -112,8 +112,9 @@ def _tf32() -> Iterator[None]:
 def repeatable(wanted: bool) -> Iterator[None]:
     """Have GPUs give the same bits every time, if wanted, at some loss of speed; the CPU does so anyway."""
     before = torch.are_deterministic_algorithms_enabled()
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which deterministic products ask for
-    torch.use_deterministic_algorithms(wanted or before)
+    if wanted:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which deterministic products ask for
+        torch.use_deterministic_algorithms(True)
     try:
         yield
     finally:

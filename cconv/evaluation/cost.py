@@ -151,7 +151,7 @@ def _peaks(
     scene: Scene,
     threads: int,
 ) -> dict[str, float]:
-    """Memory that a prediction of each model adds: on an NVIDIA GPU to what it holds already, else to a fresh process."""
+    """Memory that a prediction of each model adds: to what a GPU holds already, elsewhere to a fresh process."""
     if all(model.device.type == "cuda" for model in loaded.values()):
         return {name: device_megabytes(model, frame, scene) for name, model in loaded.items()}
     return peak_megabytes(load, models, frame, scene, threads)

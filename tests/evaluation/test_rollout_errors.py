@@ -86,7 +86,7 @@ def test_units_are_trajectories_or_single_rollouts(generator):
 
 def test_mse5_is_the_mean_of_the_first_five_frames_where_there_are_five(generator):
     class Pushed:
-        task = TASK
+        task, home = TASK, torch.device("cpu")
 
         @staticmethod
         def predict_frame(window, scene):
