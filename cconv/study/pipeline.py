@@ -11,6 +11,7 @@ import torch
 
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import dataset_findings, refuse_nonsense
+from cconv.devices import name_of
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
@@ -218,7 +219,7 @@ def _described_data(
     findings = dataset_findings(dataset, progress)
     refuse_nonsense(findings)
     observer.on_data([str(finding) for finding in findings])
-    described = describe_environment(study, dataset, workers, device)
+    described = describe_environment(study, dataset, workers, name_of(device))
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     return dataset
 

@@ -68,8 +68,7 @@ def run_trial(
     """
     configuration = configure(trial.parameters, defaults)
     training = configuration.training
-    device = find_device(training.device, "training.device")
-    model = problem.build_model(configuration, trial.init_seed).to(device)
+    model = _on_its_device(problem.build_model(configuration, trial.init_seed), training)
     config = describe(problem, trial, model, training)
     progress = _begin_or_go_on(model, folder, config)
     card = config | dict(trial.provenance)
@@ -133,6 +132,10 @@ def describe(problem: Problem, trial: Trial, model: Model, training: TrainingCon
         "num_parameters": model.num_parameters,
         "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
     }
+
+
+def _on_its_device(model: Model, training: TrainingConfig) -> Model:
+    return model.to(find_device(training.device, "training.device"))
 
 
 def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progress:
