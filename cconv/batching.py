@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int, Num
 from torch import Tensor
 
+from cconv.devices import CPU
 from cconv.errors import ShapeError
 
 # Particles of a graph of several windows at most. Joining saves a constant time for each window after the first: half
@@ -18,9 +19,10 @@ from cconv.errors import ShapeError
 MOST_JOINED = 4096
 
 
-def index_of(counts: Sequence[int]) -> Int[Tensor, " N"]:
-    """Batch index (N,) of windows with so many particles each."""
-    return torch.arange(len(counts)).repeat_interleave(torch.tensor(counts, dtype=torch.int64))
+def index_of(counts: Sequence[int], device: torch.device = CPU) -> Int[Tensor, " N"]:
+    """Batch index (N,) of windows with so many particles each, on a device."""
+    repeats = torch.tensor(counts, dtype=torch.int64, device=device)
+    return torch.arange(len(counts), device=device).repeat_interleave(repeats, output_size=sum(counts))
 
 
 def counts_of(batch_index: Int[Tensor, " N"], windows: int = 0) -> list[int]:

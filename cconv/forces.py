@@ -81,7 +81,7 @@ class ConstantForce(Force):
 
     def __call__(self, positions: Float[Tensor, "N D"]) -> Float[Tensor, "N D"]:
         """The acceleration at each position."""
-        return torch.tensor(self.acceleration, dtype=positions.dtype).expand_as(positions)
+        return positions.new_tensor(self.acceleration).expand_as(positions)
 
     def smoothed(self, deviation: float) -> Accelerating:
         """The force itself, whatever the displacements; see `Force.smoothed`."""

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cconv import tensor_cell_list
 from cconv.batching import check_batch_index, counts_of, index_of, joined_indices, joined_splits
 from cconv.cell_list import CellGrid, Cells, half_pairs, pairs_by_receiver, separations
 from cconv.domain import Box
@@ -142,7 +143,7 @@ def join_edges(parts: Sequence[Edges]) -> Edges:
         distances=torch.cat([part.distances for part in parts]),
         row_splits=joined_splits([part.row_splits for part in parts]),
         num_senders=sum(part.num_senders for part in parts),
-        batch_index=index_of(receivers).to(first.receivers.device),
+        batch_index=index_of(receivers, first.receivers.device),
     )
 
 
@@ -155,7 +156,7 @@ def radius_graph(
     batch_index: Int[Tensor, " M"] | None = None,
     query_batch_index: Int[Tensor, " N"] | None = None,
 ) -> Edges:
-    """All pairs within `cutoff`, found in a list of cells on the CPU.
+    """All pairs within `cutoff`, found in a list of cells on the device of the positions.
 
     Receivers are the queries (by default the positions themselves), senders the positions. Displacements and distances
     are differentiable with respect to both; which pairs are listed is not. Particles at exactly the same place are
@@ -179,40 +180,18 @@ def radius_graph(
         ConfigError: If the cutoff is not positive or exceeds half of a periodic axis, or `include_self` comes with
             `queries`.
     """
-    if batch_index is None and query_batch_index is None:
-        return _graph_of_window(positions, cutoff, box, queries, include_self)
-    windows = _windows(positions, queries, batch_index, query_batch_index)
-    return join_edges([_graph_of_window(points, cutoff, box, asked, include_self) for points, asked in windows])
-
-
-def _windows(
-    positions: Tensor, queries: Tensor | None, batch_index: Tensor | None, query_batch_index: Tensor | None
-) -> list[tuple[Tensor, Tensor | None]]:
-    """Sending and receiving points of each window, the latter None if they are the same."""
-    if batch_index is None or (queries is None) != (query_batch_index is None):
-        raise ShapeError("`batch_index` must come with `positions`, and `query_batch_index` exactly with `queries`.")
-    check_batch_index("batch_index", batch_index, len(positions))
-    if queries is None or query_batch_index is None:
-        return [(points, None) for points in positions.split(counts_of(batch_index, 1))]
-    check_batch_index("query_batch_index", query_batch_index, len(queries))
-    counts = counts_of(batch_index, 1)
-    asked = counts_of(query_batch_index, len(counts))
-    counts += [0] * (len(asked) - len(counts))
-    return list(zip(positions.split(counts), queries.split(asked), strict=True))
-
-
-def _graph_of_window(
-    positions: Tensor, cutoff: float, box: Box | None, queries: Tensor | None, include_self: bool
-) -> Edges:
-    """`radius_graph` of one window."""
+    if batch_index is not None or query_batch_index is not None:
+        _check_windows(positions, queries, batch_index, query_batch_index)
     receivers_at = positions if queries is None else queries
     _check_points(positions, receivers_at, box)
     _check_cutoff(cutoff, box)
     if include_self and queries is not None:
         raise ConfigError("`include_self` must be False with `queries`: they are other points than `positions`.")
-    grid, cells = _sorted_in_cells([positions] if queries is None else [queries, positions], cutoff, box)
-    pairs = pairs_by_receiver(cells[0], cells[-1], grid, include_self)
-    row_splits, receivers, senders = (torch.from_numpy(array).to(positions.device) for array in pairs)
+    of_receivers = batch_index if queries is None else query_batch_index
+    windows = None if batch_index is None or of_receivers is None else (of_receivers, batch_index)
+    search = _compiled_pairs if positions.device.type == "cpu" else _pairs_on_device
+    with torch.no_grad():
+        row_splits, receivers, senders = search(positions, queries, cutoff, box, include_self, windows)
     displacements, distances = _separations(receivers_at, positions, row_splits, receivers, senders, box)
     return Edges(
         receivers=receivers,
@@ -224,7 +203,57 @@ def _graph_of_window(
         cutoff=float(cutoff),
         bipartite=queries is not None,
         includes_self=include_self,
+        batch_index=of_receivers,
     )
+
+
+def _check_windows(
+    positions: Tensor, queries: Tensor | None, batch_index: Tensor | None, query_batch_index: Tensor | None
+) -> None:
+    if batch_index is None or (queries is None) != (query_batch_index is None):
+        raise ShapeError("`batch_index` must come with `positions`, and `query_batch_index` exactly with `queries`.")
+    check_batch_index("batch_index", batch_index, len(positions))
+    if queries is not None and query_batch_index is not None:
+        check_batch_index("query_batch_index", query_batch_index, len(queries))
+
+
+Windows = tuple[Tensor, Tensor] | None  # batch index of the receivers and of the senders
+
+
+def _pairs_on_device(
+    positions: Tensor, queries: Tensor | None, cutoff: float, box: Box | None, include_self: bool, windows: Windows
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Splits, receivers and senders of the pairs, by torch operations on the device of the points."""
+    dtype = torch.float32 if positions.device.type == "mps" else torch.float64  # which Apple's GPUs do not know
+    senders = from_corner(positions.to(dtype), box)
+    receivers = senders if queries is None else from_corner(queries.to(dtype), box)
+    lengths, skips_self = _periodic_lengths(positions.shape[1], box).tolist(), queries is None and not include_self
+    return tensor_cell_list.pairs_by_receiver(receivers, senders, cutoff, lengths, skips_self, windows)
+
+
+def _compiled_pairs(
+    positions: Tensor, queries: Tensor | None, cutoff: float, box: Box | None, include_self: bool, windows: Windows
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Splits, receivers and senders of the pairs, by compiled loops window by window."""
+    if windows is None:
+        return _compiled_pairs_of_window(positions, queries, cutoff, box, include_self)
+    count = 1 + max((int(index[-1]) for index in windows if len(index)), default=0)
+    of_receivers, of_senders = (counts_of(index, count) for index in windows)
+    asked = [None] * count if queries is None else queries.split(of_receivers)
+    parts = [
+        _compiled_pairs_of_window(*points, cutoff, box, include_self)
+        for points in zip(positions.split(of_senders), asked, strict=True)
+    ]
+    splits, receivers, senders = zip(*parts, strict=True)
+    return joined_splits(splits), joined_indices(receivers, of_receivers), joined_indices(senders, of_senders)
+
+
+def _compiled_pairs_of_window(
+    positions: Tensor, queries: Tensor | None, cutoff: float, box: Box | None, include_self: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    grid, cells = _sorted_in_cells([positions] if queries is None else [queries, positions], cutoff, box)
+    splits, receivers, senders = pairs_by_receiver(cells[0], cells[-1], grid, include_self)
+    return torch.from_numpy(splits), torch.from_numpy(receivers), torch.from_numpy(senders)
 
 
 def half_list(positions: Float[Tensor, "N D"], cutoff: float, box: Box | None = None) -> Int[np.ndarray, "P 2"]:
@@ -279,7 +308,7 @@ def _check_cutoff(cutoff: float, box: Box | None) -> None:
 
 def _sorted_in_cells(sets: Sequence[Tensor], cutoff: float, box: Box | None) -> tuple[CellGrid, list[Cells]]:
     """Cells of the cutoff around the first of `sets` of points, and each of them sorted by these cells."""
-    arrays = [from_corner(points.detach().cpu().double(), box).numpy() for points in sets]
+    arrays = [from_corner(points.detach().double(), box).numpy() for points in sets]
     grid = CellGrid.around(arrays[0], cutoff, _periodic_lengths(sets[0].shape[1], box))
     return grid, [grid.sort(points) for points in arrays]
 
@@ -288,8 +317,9 @@ def from_corner(points: Tensor, box: Box | None) -> Tensor:
     """Points brought back into the box along periodic axes and counted from its lower corner, or as they are."""
     if box is None or not any(box.periodic):
         return points.contiguous()
-    offset = box.wrap(points) - torch.tensor(box.lower, dtype=torch.float64)
-    beyond = torch.tensor(box.periodic) & (offset >= torch.tensor(box.lengths, dtype=torch.float64))  # by rounding
+    offset = box.wrap(points) - torch.tensor(box.lower, dtype=points.dtype, device=points.device)
+    lengths = torch.tensor(box.lengths, dtype=points.dtype, device=points.device)
+    beyond = torch.tensor(box.periodic, device=points.device) & (offset >= lengths)  # by rounding
     return torch.where(beyond, 0.0, offset)
 
 

@@ -15,7 +15,7 @@ from cconv.sph.kernels import CubicSpline
 from cconv.study.declared.configuration import DEFAULTS, HYPERPARAMETERS, Configuration, configure
 from cconv.study.running.problem import Problem
 from cconv.tasks import task_named
-from cconv.tasks.samples import Sample, learned_samples, make_sample, make_step_sample
+from cconv.tasks.samples import Sample, WindowSamples, learned_samples, make_sample, make_step_sample
 from cconv.tasks.task import StepTask, as_field, as_step
 
 
@@ -144,6 +144,19 @@ def problem(generator: torch.Generator, task: str = "density_rate") -> Problem:
         task=task_named(task),
         train_samples=samples(generator, 4, task, "train"),
         valid_samples=samples(generator, 2, task, "valid"),
+    )
+
+
+def steps_problem(generator: torch.Generator) -> Problem:
+    """Three training windows of smooth motion in the periodic scene, and one to roll out from."""
+    scene, task = periodic_scene(), as_step(task_named("acceleration"))
+    train = [window_of(periodic_frame(generator), generator, future=2) for _ in range(3)]
+    valid = [window_of(periodic_frame(generator), generator, future=3)]
+    return Problem(
+        scene=scene,
+        task=task,
+        train_samples=WindowSamples(train, scene, task),
+        valid_samples=WindowSamples(valid, scene, task),
     )
 
 

@@ -42,6 +42,18 @@ def test_the_benchmark_of_layers_measures_compares_and_draws(tmp_path):
     assert (tmp_path / "sweeps.png").is_file()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
+def test_the_benchmark_of_devices_measures_what_there_is_and_names_what_there_is_not(tmp_path):
+    printed = run("devices", "--dims", "2", "--out", tmp_path)
+    assert "density rate by a closed form" in printed
+    assert torch.cuda.is_available() or printed.count("unmeasured here") >= 5
+    written = json.loads((tmp_path / "devices.json").read_text())
+    assert {row["what"] for row in written["rows"]} >= {"inspect", "fit", "evaluate", "rollout frame", "solver step"}
+    assert all(row["cpu_seconds"] > 0 and row["peak_gb"] > 0 for row in written["rows"])
+    assert (tmp_path / "devices.png").is_file()
+
+
 @pytest.fixture
 def dam_break(tmp_path):
     """A folder of records as of the dam break of DPI-Net, of a block of 64 particles."""

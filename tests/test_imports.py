@@ -11,7 +11,8 @@ PACKAGE = Path(__file__).parents[1] / "cconv"
 # A room, a folder or a file of the ground floor, imports from itself and from the tiers before its own.
 TIERS = [
     {"errors", "compiled"},
-    {"batching", "domain", "files", "forces", "cell_list"},
+    {"devices"},
+    {"batching", "domain", "files", "forces", "cell_list", "tensor_cell_list"},
     {"validation", "neighbors"},
     {"ops"},
     {"sph"},

@@ -66,6 +66,12 @@ def main() -> None:
         remedy = "; make room, then continue with `cconv study resume`" if is_disk_full(error) else ""
         _print_refusal(f"{place}{error.strerror or str(error) or type(error).__name__}{remedy}")
         sys.exit(2)
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # torch's, which is imported by then
+            raise
+        reason = str(error).split(". ")[0]
+        _print_refusal(f"{reason}; take a smaller network or fewer particles at a time, or --device cpu")
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 

@@ -13,7 +13,7 @@ import typer
 from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.cli.live import TrainingBar
 from cconv.cli.options import Force, FrameDt, Mass, Spacing, given_facts
-from cconv.cli.study import DataPath, Log, RunPath, Settings, StudyFile
+from cconv.cli.study import DataPath, Device, Log, RunPath, Settings, StudyFile
 from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import Horizon, check_setting
 
@@ -25,6 +25,13 @@ if TYPE_CHECKING:
     from cconv.study.declared.study_file import StudyConfig
     from cconv.study.running.problem import Problem
 
+ModelDevice = Annotated[
+    str,
+    typer.Option(
+        metavar="DEVICE",
+        help="Where to compute: auto (the first NVIDIA GPU, or else the CPU), cpu, cuda, cuda:N or mps.",
+    ),
+]
 TRAINED_AT = (
     ("particle_spacing", "particle spacing", 1e-6),
     ("frame_dt", "time between frames", 0.01),
@@ -36,6 +43,7 @@ def train(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write; it must not exist yet.")],
     data: DataPath = None,
     log: Log = None,
+    device: Device = None,
     settings: Settings = None,
 ) -> None:
     """Train the network of a study file, without a search.
@@ -47,7 +55,7 @@ def train(
     from cconv.study.running.problem import provenance
     from cconv.study.running.trial import Trial, run_trial
 
-    config = _declared_study(study, data, settings, out, log)
+    config = _declared_study(study, data, settings, out, device, log)
     problem, dataset = _loaded_problem(config)
     folder = TrialFolder(out)
     seeds = {"init_seed": config.seeds.init, "data_seed": config.seeds.data}
@@ -83,6 +91,7 @@ def fit(
             help="Weight of the penalty on squared coefficients, relative to the mean square of a term of the layer."
         ),
     ] = 1e-10,
+    device: Device = None,
     settings: Settings = None,
 ) -> None:
     """Fit a single layer to the data of a study by least squares, in seconds and without training.
@@ -91,16 +100,18 @@ def fit(
     "radial_net" or "conv_net", message, relative_cutoff, window. The checkpoint evaluates like a trained one
     (`cconv evaluate DIR`).
     """
+    from cconv.devices import home_of, name_of
     from cconv.models.checkpoint import save_model
     from cconv.study.declared.configuration import check_least_squares
     from cconv.study.declared.stage import Ridge
-    from cconv.study.running.problem import provenance
+    from cconv.study.running.problem import device_of, provenance
 
     check_setting(Ridge, ridge, "--ridge")
-    config = _declared_study(study, data, settings, out)
+    config = _declared_study(study, data, settings, out, device)
     check_least_squares(config.training.loss, "a single layer")
     problem, dataset = _loaded_problem(config)
-    model = problem.build_model(config.configuration, config.seeds.init)
+    placed = home_of(device_of(config))  # float64 is needed
+    model = problem.build_model(config.configuration, config.seeds.init).to(placed)
     places = show_progress(range(len(problem.train_samples)), "fit")
     problem.solve_closed_form(model, config.training, places, ridge, config.seeds.data)
     error = problem.objective.error(model, show_progress(problem.valid_samples, "validate"))
@@ -110,6 +121,7 @@ def fit(
         "network": config.network.model_dump(),
         "ridge": ridge,
         "data_seed": config.seeds.data,
+        "device": name_of(placed),
         "num_parameters": model.num_parameters,
         "valid_error": error,
     }
@@ -139,6 +151,7 @@ def evaluate(
     particle_spacing: Spacing = None,
     frame_dt: FrameDt = None,
     force: Force = None,
+    device: ModelDevice = "auto",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
     """Report the error of a saved model on a split of a data set, by default the test split.
@@ -148,6 +161,7 @@ def evaluate(
     data that it was trained on.
     """
     from cconv.data.plausibility import dataset_findings
+    from cconv.devices import find_device, name_of
     from cconv.evaluation.objectives import objective_of
     from cconv.models.checkpoint import load_model, read_card
     from cconv.study.running.problem import open_card_data
@@ -157,7 +171,7 @@ def evaluate(
     if horizon is not None:
         check_setting(Horizon, horizon, "--horizon")
     checkpoint = recommended_checkpoint(checkpoint)
-    model, card = load_model(checkpoint, task), read_card(checkpoint)
+    model, card = load_model(checkpoint, task, find_device(device)), read_card(checkpoint)
     if horizon is not None and not isinstance(model.task, StepTask):
         raise ConfigError(f"`--horizon` is for steps, and {model.task.name!r} is a field of one frame; leave it out.")
     given = given_facts(mass, particle_spacing, frame_dt, force)
@@ -165,9 +179,9 @@ def evaluate(
     rolled = horizon or card.get("horizon") or HORIZON
     windows = replace(model.task, history=card.get("window") or model.task.history)  # as its study compared models
 
-    def samples(split: str, verb: str) -> list:
+    def samples(split: str, verb: str) -> Sequence:
         label = f"{verb} {split}"
-        return list(show_progress(compared_samples(dataset, split, windows, rolled), label))
+        return compared_samples(dataset, split, windows, rolled, lambda numbers: show_progress(numbers, label))
 
     asked, objective = samples(split, "read"), objective_of(model.task)
     training = samples("train", "read") if is_own and split != "train" else asked if is_own else None
@@ -180,6 +194,7 @@ def evaluate(
         "objective": objective.name,
         **_errors_by(objective, model, asked, training, show_progress(asked, f"evaluate {split}")),
         "num_parameters": model.num_parameters,
+        "device": name_of(model.device),
         "relaxation": None if model.config.relaxation is None else model.config.relaxation.model_dump(),
         **scale_facts(dataset.scene, model.config),
     }
@@ -327,10 +342,15 @@ def report(
 
 
 def _declared_study(
-    study: Path, data: str | None, settings: list[str] | None, out: Path, log: list[str] | None = None
+    study: Path,
+    data: str | None,
+    settings: list[str] | None,
+    out: Path,
+    device: str | None,
+    log: list[str] | None = None,
 ) -> "StudyConfig":
     """Return the settings of a study whose single model is written to `out`, which must not exist yet."""
-    from cconv.study.running.problem import with_data_path
+    from cconv.study.running.problem import device_of, with_data_path, with_device
     from cconv.study.running.training_logs import with_loggers
     from cconv.study.studies import load_study
 
@@ -338,6 +358,9 @@ def _declared_study(
     config = with_loggers(config, config.log if log is None else log)
     if data is not None:
         config = with_data_path(config, data)
+    if device is not None:
+        config = with_device(config, device)
+    device_of(config)
     if out.exists():
         raise ConfigError(f"{out}: exists already; give another --out.")
     return config

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cconv.cli.console import INTERRUPTED, errors, print_findings, print_json, results, show_progress
-from cconv.cli.model import other_scales, recommended_checkpoint, relaxation_words, scale_facts
+from cconv.cli.model import ModelDevice, other_scales, recommended_checkpoint, relaxation_words, scale_facts
 from cconv.cli.options import AsJson, Force, FrameDt, Mass, Spacing, given_facts
 from cconv.cli.study import DataPath
 from cconv.errors import CConvError, ConfigError, shown
@@ -66,6 +66,7 @@ def rollout(
     particle_spacing: Spacing = None,
     frame_dt: FrameDt = None,
     force: Force = None,
+    device: ModelDevice = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Roll a saved model out by its own answers, and compare it with the stored frames.
@@ -76,6 +77,7 @@ def rollout(
     """
     from cconv.data.plausibility import trajectory_findings
     from cconv.data.stored_frames import StoredFrames
+    from cconv.devices import find_device, name_of
     from cconv.evaluation.recorded_rollout import asked_rollout, record_rollout, rollout_facts, write_rollout
     from cconv.models.checkpoint import load_model, read_card
     from cconv.rollout.correctors import SPHRelaxation, correctors_of
@@ -89,7 +91,7 @@ def rollout(
         raise ConfigError(f"`--frames` must be at least 1, got {frames}.")
     given_correctors = _given_correctors(relax, no_relax)
     checkpoint = recommended_checkpoint(checkpoint)
-    model, card = load_model(checkpoint), read_card(checkpoint)
+    model, card = load_model(checkpoint, device=find_device(device)), read_card(checkpoint)
     given = given_facts(mass, particle_spacing, frame_dt, force)
     dataset, is_own = open_card_data(card, data, given)
     stored = StoredFrames(dataset, split, trajectory)
@@ -108,6 +110,7 @@ def rollout(
         print_findings(trajectory_findings(dataset.trajectory(split, trajectory), dataset.scene))
     facts = {"checkpoint": str(checkpoint), "data": str(dataset.path), "split": split, "trajectory": trajectory}
     facts |= {"first_frame": start, "history": len(asked.begun), **rollout_facts(recorded)}
+    facts["device"] = name_of(model.device)
     facts["relaxation"] = next((asdict(each) for each in correctors if isinstance(each, SPHRelaxation)), None)
     facts["solver"] = _solver_facts(dataset, recorded)
     if out is not None:

@@ -39,6 +39,14 @@ Settings = Annotated[
 ]
 
 
+Device = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DEVICE",
+        help="Where to compute: auto (the first NVIDIA GPU, or else the CPU), cpu, cuda, cuda:N or mps; replaces "
+        "training.device.",
+    ),
+]
 Address = Annotated[
     str | None,
     typer.Option(
@@ -88,6 +96,7 @@ def run(
     serial: Serial = False,
     storage: Storage = None,
     log: Log = None,
+    device: Device = None,
     settings: Settings = None,
 ) -> None:
     """Run a whole study: every stage that its file declares, then the report.
@@ -100,7 +109,7 @@ def run(
     from cconv.study.declared.search_space import study_space
     from cconv.study.pipeline import begin_study
     from cconv.study.records.run_folder import RunFolder
-    from cconv.study.running.problem import open_study_data, with_data_path
+    from cconv.study.running.problem import device_of, open_study_data, with_data_path, with_device
     from cconv.study.running.training_logs import with_loggers
     from cconv.study.studies import load_study
 
@@ -110,6 +119,9 @@ def run(
     config.check_stages()
     if data is not None:
         config = with_data_path(config, data)
+    if device is not None:
+        config = with_device(config, device)
+    device_of(config)
     space = study_space(config)
     open_study_data(config.data, config.seeds.data)
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
@@ -124,20 +136,27 @@ def run(
 
 @app.command()
 def resume(
-    path: RunPath, data: DataPath = None, address: Address = None, serial: Serial = False, storage: Storage = None
+    path: RunPath,
+    data: DataPath = None,
+    address: Address = None,
+    serial: Serial = False,
+    storage: Storage = None,
+    device: Device = None,
 ) -> None:
     """Continue a study that was interrupted or killed.
 
     Finished stages and finished trials are kept. Every other training continues from its last evaluation, and earlier
     decisions of ASHA are kept.
     """
-    from cconv.study.pipeline import move_data
+    from cconv.study.pipeline import change_device, move_data
     from cconv.study.records.run_folder import RunFolder
 
     _check_place(address, serial)
     folder = RunFolder.open(path)
     if data is not None:
         move_data(folder, data)
+    if device is not None:
+        change_device(folder, device)
     _run_stages(folder, address, storage, serial)
 
 

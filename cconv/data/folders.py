@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 
+from cconv.data.limits import readable_size
 from cconv.errors import ConfigError
 from cconv.files import replacing
 
@@ -65,6 +66,17 @@ def check_free(folder: Path, files: Iterable[str], overwrite: bool) -> None:
         raise ConfigError(f"{folder}: holds other files than are to be replaced ({others}); name another folder.")
     if present and not overwrite:
         raise ConfigError(f"{folder}: exists and is not empty; name another folder or overwrite it.")
+
+
+def check_room(folder: Path, size: int) -> None:
+    """Raise `ConfigError` unless the disk of a folder, which may not exist yet, has room for at least so many bytes."""
+    place = next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    free = shutil.disk_usage(place).free
+    if size > free:
+        raise ConfigError(
+            f"{folder}: at least {readable_size(size)} would be written, and {readable_size(free)} are free there; "
+            "make room, name a folder on a larger disk, or ask for fewer frames."
+        )
 
 
 def _remove_left_behind(folder: Path) -> None:

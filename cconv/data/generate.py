@@ -9,7 +9,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +19,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from cconv import scenes, sph
-from cconv.data.folders import check_free
-from cconv.data.hdf5 import FILES, write_splits
+from cconv.data.folders import check_free, check_room
+from cconv.data.hdf5 import FILES, LEAST_COMPRESSED, write_splits
 from cconv.data.metadata import OWN_KEY
 from cconv.data.side_by_side import available_cores, side_by_side
 from cconv.data.simulate import Simulation, simulate
@@ -90,6 +90,7 @@ def generate(
     with _unfinished_folder(unfinished, request, overwrite):
         files = [unfinished / f"{index:05d}{_SUFFIX}" for index in range(count)]
         calls = [(scene, frames, seed, index, file) for index, file in enumerate(files) if not _is_whole(file)]
+        check_room(folder, _least_bytes(scene, frames, count, len(calls)))
         workers = max(1, min(workers or available_cores(), len(calls)))
         for _ in progress(_Frames(calls, frames + scene.skipped_frames, workers), f"{scene.name}, frames"):
             pass
@@ -98,6 +99,13 @@ def generate(
         failures = tuple(line for file in files for line in _facts(file)["failures"])
         shutil.rmtree(unfinished)
     return Generated(count - len(calls), failures)
+
+
+def _least_bytes(scene: SimulatedScene, num_frames: int, count: int, unfinished: int) -> int:
+    """Bytes that a data set takes at least: raw ones of trajectories yet to compute, and all of them compressed."""
+    start = replace(scene, relaxation_steps=0).initial_state(torch.Generator().manual_seed(0))
+    raw = 2 * 4 * num_frames * start.positions.numel()  # positions and velocities, float32
+    return int(raw * (unfinished + LEAST_COMPRESSED * count))
 
 
 def _check_numbers(num_trajectories: int, num_frames: int, workers: int | None) -> None:

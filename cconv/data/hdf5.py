@@ -9,6 +9,7 @@ Source: Toshev et al. (2023), LagrangeBench: A Lagrangian Fluid Mechanics Benchm
 
 import itertools
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from cconv.data.folders import whole_folder
 from cconv.data.hdf5_members import check_stored, linked
-from cconv.data.limits import one_line
+from cconv.data.limits import check_size, one_line
 from cconv.data.metadata import (
     METADATA,
     default_mass,
@@ -35,7 +36,10 @@ from cconv.domain import Box
 from cconv.errors import CConvError, DataError
 
 FILES = (*(f"{split}.h5" for split in SPLITS), METADATA)
+BY_FRAME = ("position", "velocity")
 FRAMES_PER_CHUNK = 8
+LEAST_COMPRESSED = 0.5  # of the bytes of frames is what gzip leaves at least of particles in motion
+CHUNK_BYTES = 2**24  # of a chunk of several frames, which is read whole for any of them
 MOST_TRAJECTORIES = 100_000
 LONGEST_NAME = 100
 
@@ -267,7 +271,10 @@ def write_constants(group: h5py.Group, trajectory: Trajectory, scene: Scene) -> 
 
 
 def _write(group: h5py.Group, key: str, values: Tensor, by_frame: bool = False) -> None:
-    chunks = (min(FRAMES_PER_CHUNK, len(values)), *values.shape[1:]) if by_frame else None
+    chunks = None
+    if by_frame:
+        frames = max(1, min(FRAMES_PER_CHUNK, len(values), CHUNK_BYTES // values[0].nbytes))
+        chunks = (frames, *values.shape[1:])
     # Without times of creation in the file, the same values give the same bytes.
     group.create_dataset(key, data=values.cpu().numpy(), chunks=chunks, compression="gzip", track_times=False)
 
@@ -339,7 +346,7 @@ def _member(group: h5py.Group, key: str, file: Path, name: str) -> h5py.Dataset:
     if not isinstance(stored, h5py.Dataset):
         found = one_line(", ".join(itertools.islice(group, 20))) or "nothing"
         raise DataError(f"{file}: trajectory {name}: `{key}` is missing (found: {found}); write it or copy it again.")
-    check_stored(stored, file.parent, f"{file}: trajectory {name}: `{key}`")
+    check_stored(stored, file.parent, f"{file}: trajectory {name}: `{key}`", by_frame=key in BY_FRAME)
     return stored
 
 
@@ -381,6 +388,8 @@ def _optional(group: h5py.Group, key: str, file: Path, name: str, shape: tuple[i
 
 
 def _finite_frames(stored: h5py.Dataset, frames: slice, file: Path, name: str) -> Tensor:
+    asked = len(range(*frames.indices(len(stored)))) * stored.dtype.itemsize * math.prod(stored.shape[1:])
+    check_size(asked, asked, f"{file}: trajectory {name}")
     values = stored[frames]
     if len(values) == 0:
         raise DataError(f"{file}: trajectory {name} has {len(stored)} frames, none from {frames.start} on.")

@@ -37,7 +37,7 @@ def linked(group: h5py.Group, key: str, place: str, depth: int = 0) -> h5py.Grou
     return target
 
 
-def check_stored(dataset: h5py.Dataset, folder: Path, place: str, depth: int = 0) -> None:
+def check_stored(dataset: h5py.Dataset, folder: Path, place: str, depth: int = 0, by_frame: bool = False) -> None:
     """Raise `DataError` unless a data set holds numbers, lies in `folder`, fits into memory and was written whole.
 
     Args:
@@ -45,6 +45,7 @@ def check_stored(dataset: h5py.Dataset, folder: Path, place: str, depth: int = 0
         folder: Folder of the data. Sources of virtual data sets may be files in it.
         place: File, trajectory and member, for messages.
         depth: How many virtual data sets led here.
+        by_frame: Whether it is read frame by frame, so that only one has to fit.
     """
     _check_type(dataset, place)
     _check_filters(dataset, place)
@@ -54,7 +55,8 @@ def check_stored(dataset: h5py.Dataset, folder: Path, place: str, depth: int = 0
     if dataset.is_virtual:
         _check_sources(dataset, folder, place, depth)
         return
-    check_size(dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), place)
+    size = dataset.size * dataset.dtype.itemsize
+    check_size(size, dataset.id.get_storage_size(), place, size // len(dataset) if by_frame else size)
     _check_written(dataset, place)
 
 

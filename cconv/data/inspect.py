@@ -7,6 +7,7 @@ import torch
 
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import MOST_NEIGHBORS, SharedFrames, first_of_each, mean_neighbors, trajectory_findings
+from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import ConfigError
@@ -38,10 +39,11 @@ def inspect_dataset(
     for split, blocks in dataset.splits.items():
         splits[split] = {"trajectories": len(blocks), "frames": 0}
         for k in progress(range(len(blocks)), split):
-            trajectory = dataset.trajectory(split, k)
-            splits[split]["frames"] += len(trajectory)
-            _collect(collected, trajectory, scene.box, cutoff)
-            findings += [*trajectory_findings(trajectory, scene), *shared.findings(split, trajectory)]
+            stored = StoredFrames(dataset, split, k)
+            splits[split]["frames"] += len(stored)
+            for piece in stored.pieces():
+                _collect(collected, piece, scene.box, cutoff)
+                findings += [*trajectory_findings(piece, scene), *shared.findings(split, piece)]
     return {
         "path": str(dataset.path),
         "format": dataset.format,
@@ -87,7 +89,7 @@ def _particle_facts(collected: dict[ParticleType | str, list], cutoff: float) ->
 
 
 def _collect(collected: dict[ParticleType | str, list], trajectory: Trajectory, box: Box, cutoff: float) -> None:
-    """Append what one trajectory has; neighbours are counted in its first and last frame."""
+    """Append what a trajectory, or a piece of it, has; neighbours are counted in its first and last frame."""
     for kind in ParticleType:
         collected[kind].append(int((trajectory.particle_types == kind).sum()))
     boundary = trajectory.boundary

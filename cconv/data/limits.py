@@ -10,18 +10,19 @@ SMALL = 64 * 2**20  # bytes that are read whatever their ratio
 LONGEST_TEXT = 200
 
 
-def check_size(size: int, stored: int, place: str) -> None:
+def check_size(size: int, stored: int, place: str, at_once: int | None = None) -> None:
     """Raise `DataError` if what is stored in `stored` bytes would take `size` bytes that no honest file of it needs.
 
     Args:
         size: Bytes once it is read.
         stored: Bytes in the file.
         place: File and member, for the message.
+        at_once: Bytes of the part that is read at a time; None for all.
     """
-    room = memory_limit()
-    if size > room:
+    room, read = memory_limit(), size if at_once is None else at_once
+    if read > room:
         raise DataError(
-            f"{place} takes {readable_size(size)}, more than {readable_size(room)}, half of the memory that is free; "
+            f"{place} takes {readable_size(read)}, more than {readable_size(room)}, half of the memory that is free; "
             "cut it into shorter trajectories."
         )
     if size > SMALL and size > LARGEST_RATIO * stored:

@@ -19,6 +19,7 @@ from cconv.data.dataset import Dataset
 from cconv.data.quantities import density_deviation
 from cconv.data.source import STORED
 from cconv.data.splits import evenly_spaced
+from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import ParticleType, Scene, Trajectory
 from cconv.errors import DataError
 from cconv.sph.kernels import QuinticSpline
@@ -77,7 +78,7 @@ def dataset_findings(
     progress: Callable[[Iterable, str], Iterable] = lambda items, _: items,
     splits: Sequence[str] | None = None,
 ) -> list[DataFinding]:
-    """Find the implausibilities of a data set; every trajectory of its splits is read, one at a time.
+    """Find the implausibilities of a data set; every trajectory of its splits is read, long ones piece by piece.
 
     Args:
         dataset: The data set.
@@ -90,8 +91,8 @@ def dataset_findings(
     blocks = [(split, k) for split in splits or dataset.splits for k in range(len(dataset.splits[split]))]
     shared, found = SharedFrames(), []
     for split, k in progress(blocks, "check data"):
-        trajectory = dataset.trajectory(split, k)
-        found += [*trajectory_findings(trajectory, dataset.scene), *shared.findings(split, trajectory)]
+        for piece in StoredFrames(dataset, split, k).pieces():
+            found += [*trajectory_findings(piece, dataset.scene), *shared.findings(split, piece)]
     return first_of_each(found)
 
 

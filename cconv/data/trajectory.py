@@ -1,13 +1,14 @@
 """The data that readers return: a scene, its trajectories, their frames."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from cconv.devices import moved
 from cconv.domain import Box
 from cconv.errors import ConfigError
 from cconv.forces import Force
@@ -36,6 +37,10 @@ class Boundary:
     positions: Tensor
     normals: Tensor | None
     batch_index: Tensor | None = None
+
+    def to(self, device: torch.device) -> "Boundary":
+        """The same on a device."""
+        return moved(self, device, ("positions", "normals", "batch_index"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +90,15 @@ class Frame:
     particle_types: Tensor
     boundary: Boundary | None
 
+    @property
+    def device(self) -> torch.device:
+        """Where the particles are stored."""
+        return self.positions.device
+
+    def to(self, device: torch.device) -> "Frame":
+        """The same on a device."""
+        return moved(self, device, ("positions", "velocities", "masses", "particle_types", "boundary"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
@@ -125,7 +139,14 @@ class Trajectory:
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
 
+    def between(self, start: int, stop: int) -> "Trajectory":
+        """Some of the frames, from `start` up to `stop`, counted from the first one here; memory is shared."""
+        frames = slice(start, stop)
+        first = self.first_frame + start
+        return replace(self, first_frame=first, positions=self.positions[frames], velocities=self.velocities[frames])
 
+
+@runtime_checkable
 class Frames(Protocol):
     """Consecutive frames of one simulation, in memory as a `Trajectory` or read when they are asked for.
 
@@ -151,6 +172,8 @@ class Frames(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+    def between(self, start: int, stop: int) -> Trajectory: ...
 
 
 def time_of(trajectory: Frames, index: int, frame_dt: float) -> float:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from cconv.batching import counts_of, groups_of, index_of
-from cconv.data.trajectory import Boundary, ParticleType, Trajectory
+from cconv.data.trajectory import Boundary, Frames, ParticleType
+from cconv.devices import moved
 from cconv.domain import Box
 from cconv.errors import DataError, ShapeError, check_shape
 
@@ -68,6 +69,16 @@ class Window:
     def is_fluid(self) -> Tensor:
         """Which particles a model moves, (N,), bool."""
         return self.particle_types == ParticleType.FLUID
+
+    @property
+    def device(self) -> torch.device:
+        """Where the particles are stored."""
+        return self.positions.device
+
+    def to(self, device: torch.device) -> "Window":
+        """The same on a device."""
+        names = ("positions", "future", "masses", "particle_types", "boundary", "batch_index")
+        return moved(self, device, names)
 
     def ending(self, history: int) -> "Window":
         """The same window without its oldest frames: at most `history` up to the present."""
@@ -151,7 +162,7 @@ def join_windows(windows: Sequence[Window]) -> Window:
         masses=torch.cat([window.masses for window in windows]),
         particle_types=torch.cat([window.particle_types for window in windows]),
         boundary=_joined_boundaries([window.boundary for window in windows if window.boundary is not None]),
-        batch_index=index_of([len(window.masses) for window in windows]),
+        batch_index=index_of([len(window.masses) for window in windows], first.device),
         joined=tuple(origin for window in windows for origin in window.origins),
     )
 
@@ -175,7 +186,7 @@ def _joined_boundaries(boundaries: Sequence[Boundary]) -> Boundary | None:
     return Boundary(
         positions=torch.cat([boundary.positions for boundary in boundaries]),
         normals=torch.cat(normals) if normals else None,
-        batch_index=index_of([len(boundary.positions) for boundary in boundaries]),
+        batch_index=index_of([len(each.positions) for each in boundaries], boundaries[0].positions.device),
     )
 
 
@@ -189,7 +200,7 @@ def _separated_boundaries(boundary: Boundary | None, windows: int) -> Sequence[B
     return [Boundary(positions=positions, normals=some) for positions, some in parts]
 
 
-def window_at(trajectory: Trajectory, present: int, history: int, future: int) -> Window:
+def window_at(trajectory: Frames, present: int, history: int, future: int) -> Window:
     """The window of a trajectory whose present is one of its frames.
 
     Args:
@@ -202,13 +213,13 @@ def window_at(trajectory: Trajectory, present: int, history: int, future: int) -
         DataError: If the trajectory does not have all these frames.
     """
     check_window(trajectory.name, len(trajectory), present, history, future)
-    first, stop = present - history + 1, present + 1 + future
+    frames = trajectory.between(present - history + 1, present + 1 + future)
     return Window(
-        positions=trajectory.positions[first : present + 1],
-        future=trajectory.positions[present + 1 : stop],
-        masses=trajectory.masses,
-        particle_types=trajectory.particle_types,
-        boundary=trajectory.boundary,
+        positions=frames.positions[:history],
+        future=frames.positions[history:],
+        masses=frames.masses,
+        particle_types=frames.particle_types,
+        boundary=frames.boundary,
         trajectory=trajectory.name,
         frame=trajectory.first_frame + present,
     )
@@ -281,10 +292,10 @@ def check_length(trajectory: str, frames: int, history: int, future: int) -> Non
 
 
 class Windows(Sequence[Window]):
-    """All windows of some trajectories, or every one at a stride, each cut out when it is asked for.
+    """All windows of some trajectories, or every one at a stride, each cut out or read when it is asked for.
 
-    They share the frames of the trajectories, in memory and when they are sent to another process. LagrangeBench's test
-    windows do not overlap: their stride is ``history + future``.
+    They share frames of trajectories that are in memory, also when they are sent to another process. LagrangeBench's
+    test windows do not overlap: their stride is ``history + future``.
 
     Args:
         trajectories: The trajectories.
@@ -297,9 +308,7 @@ class Windows(Sequence[Window]):
         DataError: If a trajectory is too short for a single one.
     """
 
-    def __init__(
-        self, trajectories: Iterable[Trajectory], history: int, future: int, stride: int = 1, further: int = 0
-    ):
+    def __init__(self, trajectories: Iterable[Frames], history: int, future: int, stride: int = 1, further: int = 0):
         self._trajectories = list(trajectories)
         self._history, self._future, self._further = history, future, further
         self._places = [
@@ -308,7 +317,7 @@ class Windows(Sequence[Window]):
             for present in self._presents(trajectory, stride)
         ]
 
-    def _presents(self, trajectory: Trajectory, stride: int) -> range:
+    def _presents(self, trajectory: Frames, stride: int) -> range:
         check_length(trajectory.name, len(trajectory), self._history, self._future)
         return range(self._history - 1, len(trajectory) - self._future, stride)
 

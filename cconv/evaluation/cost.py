@@ -15,8 +15,9 @@ import torch
 
 from cconv.data.trajectory import Boundary, Frame, ParticleType, Scene
 from cconv.data.window import Window
+from cconv.devices import name_of, wait_for
 from cconv.domain import Box
-from cconv.evaluation.memory import peak_megabytes
+from cconv.evaluation.memory import device_megabytes, peak_megabytes
 from cconv.models.model import Model, ModelConfig
 from cconv.neighbors import radius_graph
 from cconv.networks.counting import CountedCost, NeighborDensity
@@ -53,6 +54,7 @@ class Cost:
         flops_per_particle: Multiplications and additions of a prediction per particle.
         threads: Number of threads of the measurement.
         num_particles: Mean number of fluid particles of a frame.
+        device: Where models were timed, on frames that stood there.
     """
 
     ms_per_frame: float
@@ -66,6 +68,7 @@ class Cost:
     flops_per_particle: float
     threads: int
     num_particles: float
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +124,7 @@ def measure_costs(
         calls[ANALYTIC] = _analytic_call(task, frames, scene)
     with torch_threads(threads):
         times = _times_in_turn(calls, repeats)
-    peaks = peak_megabytes(load, models, frames[0], scene, threads)
+    peaks = _peaks(loaded, load, models, frames[0], scene, threads)
     particles = statistics.fmean(_num_fluid(frame) for frame in frames)
     costs = {}
     for name, model in loaded.items():
@@ -134,9 +137,24 @@ def measure_costs(
             flops_per_particle=flops_per_particle(model, model.inputs(frames[0], scene)),
             threads=threads,
             num_particles=particles,
+            device=name_of(model.device),
         )
     analytic = times.get(ANALYTIC)
     return costs, None if analytic is None else AnalyticCost(**_medians(analytic), turns_ms=_turns(analytic))
+
+
+def _peaks(
+    loaded: Mapping[str, Model],
+    load: Callable[[Path], Model],
+    models: Mapping[str, Path],
+    frame: Frame | Window,
+    scene: Scene,
+    threads: int,
+) -> dict[str, float]:
+    """Memory that a prediction of each model adds: to what a GPU holds already, elsewhere to a fresh process."""
+    if all(model.device.type == "cuda" for model in loaded.values()):
+        return {name: device_megabytes(model, frame, scene) for name, model in loaded.items()}
+    return peak_megabytes(load, models, frame, scene, threads)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +319,8 @@ def _times_in_turn(calls: Mapping[str, Call], repeats: int) -> dict[str, list[tu
 
 
 def _model_call(model: Model, frames: Sequence[Frame] | Sequence[Window], scene: Scene) -> Call:
-    return lambda turn: _time_prediction(model, frames[turn % len(frames)], scene)
+    placed = [frame.to(model.home) for frame in frames]
+    return lambda turn: _time_prediction(model, placed[turn % len(placed)], scene)
 
 
 def _analytic_call(task: FieldTask, frames: Sequence[Any], scene: Scene) -> Call:
@@ -340,22 +359,30 @@ def _at_constant_velocity(frame: Frame, scene: Scene, history: int) -> Window:
 
 
 def _time_prediction(model: Model, frame: Frame | Window, scene: Scene) -> tuple[float, float]:
-    """Time a prediction outside the network and inside it; what corrects a rollout of the model counts outside."""
+    """Time a prediction outside the network and inside it; what corrects a rollout of the model counts outside.
+
+    The device has done all its work before the clock is read.
+    """
     marks = []
+
+    def read_clock(*_: Any) -> None:
+        wait_for(model.device)
+        marks.append(time.perf_counter())
+
     hooks = [
-        model.network.register_forward_pre_hook(lambda *_: marks.append(time.perf_counter())),
-        model.network.register_forward_hook(lambda *_: marks.append(time.perf_counter())),
+        model.network.register_forward_pre_hook(read_clock),
+        model.network.register_forward_hook(read_clock),
     ]
-    start = time.perf_counter()
+    read_clock()
     model.predict_frame(frame, scene)
     if isinstance(frame, Window):
         for corrector in correctors_of(model):
             corrector(frame, frame, scene)
-    total = time.perf_counter() - start
+    read_clock()
     for hook in hooks:
         hook.remove()
-    network = marks[1] - marks[0]
-    return total - network, network
+    start, before, after, end = marks
+    return end - start - (after - before), after - before
 
 
 def _time_analytic(task: FieldTask, sums: CompiledSums, frame: Frame, scene: Scene) -> tuple[float, float]:

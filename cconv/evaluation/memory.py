@@ -59,6 +59,17 @@ def _send_growth(sender: Connection, load: Load, path: Path, frame: Frame | Wind
     sender.send(peak_resident_megabytes() - before)
 
 
+def device_megabytes(model: Model, frame: Frame | Window, scene: Scene) -> float:
+    """Measure how much a prediction adds to what torch holds on an NVIDIA GPU, MB."""
+    placed = frame.to(model.home)
+    torch.cuda.synchronize(model.device)
+    torch.cuda.reset_peak_memory_stats(model.device)
+    before = torch.cuda.memory_allocated(model.device)
+    model.predict_frame(placed, scene)
+    torch.cuda.synchronize(model.device)
+    return (torch.cuda.max_memory_allocated(model.device) - before) / 2**20
+
+
 def peak_resident_megabytes() -> float:
     """Return the peak memory of this process; on Linux from /proc, as `getrusage` would return the parent's peak."""
     status = Path("/proc/self/status")

@@ -15,6 +15,7 @@ from cconv.data.metadata import DIFFERENCES
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import Scene, Trajectory
 from cconv.data.window import Window, check_window, window_at
+from cconv.devices import wait_for
 from cconv.evaluation.rollout_comparison import RolloutMeter, RolloutMetrics, check_masses, speed_edges
 from cconv.models.model import Model
 from cconv.rollout.correctors import Corrector
@@ -136,14 +137,17 @@ def record_rollout(
         Diverged: If the first frame would not be a state of particles any more.
         KeyboardInterrupt: If Ctrl-C came before a frame was measured.
     """
-    meter, path = _meter(asked), rollout(model, asked.start, asked.scene, correctors=asked.correctors)
+    path = rollout(model, asked.start.to(model.home), asked.scene, correctors=asked.correctors)
+    meter = _meter(asked)
     times: list[float] = []
     ended = None
     try:
         for _, stored in zip(progress(range(asked.frames), "rollout"), asked.stored(), strict=True):
             before = time.perf_counter()
-            positions = next(path).present
+            present = next(path).present
+            wait_for(model.device)
             spent = 1e3 * (time.perf_counter() - before)
+            positions = present.cpu()
             keep(positions, stored)
             times.append(spent)
             meter.add(positions, stored)

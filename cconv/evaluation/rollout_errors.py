@@ -50,7 +50,8 @@ def worst_error(box: Box) -> float:
 
 def rollouts_of(model: Model, samples: Iterable[Sample]) -> list[RolloutErrors]:
     """Roll a model out, with its relaxation, from samples of its task, for as many frames as are known after each."""
-    asked = [replace(start, task=as_step(model.task)) for start in starts(samples)]  # its integrator may be another
+    task, home = as_step(model.task), model.home  # its integrator may be another
+    asked = [replace(start.to(home), task=task) for start in starts(samples)]
     return joined_errors(model.predict_frame, asked, correctors_of(model))
 
 

@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from cconv.devices import CPU
 from cconv.errors import ConfigError, shown
 from cconv.files import read_json
 from cconv.models.model import Model, ModelConfig, untrained, without_weights
@@ -47,7 +48,7 @@ def save_model(model: Model, folder: Path | str, card: dict) -> None:
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     try:
-        save_file({name: tensor.contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
+        save_file({name: tensor.cpu().contiguous() for name, tensor in model.state_dict().items()}, fresh / WEIGHTS)
         (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **model.config.model_dump(mode="json")}, indent=2))
         (fresh / CARD).write_text(json.dumps(card, indent=2, allow_nan=False))
         if not folder.exists():
@@ -59,12 +60,13 @@ def save_model(model: Model, folder: Path | str, card: dict) -> None:
         shutil.rmtree(fresh, ignore_errors=True)
 
 
-def load_model(path: Path | str, task: str | None = None) -> Model:
+def load_model(path: Path | str, task: str | None = None, device: torch.device | str = CPU) -> Model:
     """Load a model from a folder that `save_model` wrote.
 
     Args:
         path: Folder with `model.safetensors` and `config.json`.
         task: Required task of the model; None allows any.
+        device: Where it is to compute, whatever device it was trained on.
 
     Raises:
         ConfigError: If files are missing, damaged or do not belong together, or the model is for another task.
@@ -83,7 +85,7 @@ def load_model(path: Path | str, task: str | None = None) -> Model:
     tensors = _read_weights(folder, config)
     model = untrained(config)
     model.load_state_dict(tensors)
-    return model.eval()
+    return model.eval().to(device)
 
 
 def _read_config(path: Path) -> ModelConfig:

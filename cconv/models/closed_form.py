@@ -7,13 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cconv.data.dataset import Dataset
+from cconv.devices import CPU
 from cconv.errors import ConfigError
 from cconv.models.model import Model, build_model
 from cconv.networks import RadialNetSettings
 from cconv.networks.network import NetworkSettings
 from cconv.tasks import task_named
 from cconv.tasks.inputs import Inputs
-from cconv.tasks.samples import Sample, iterate_samples
+from cconv.tasks.samples import FrameSamples, Sample
 from cconv.tasks.task import as_field
 
 
@@ -23,11 +24,12 @@ class NormalEquations:
     Args:
         num_terms: Number of coefficients P of each output.
         num_outputs: Number of outputs C.
+        device: Where they are summed and solved.
     """
 
-    def __init__(self, num_terms: int, num_outputs: int):
-        self._products = torch.zeros(num_terms, num_terms, dtype=torch.float64)
-        self._projections = torch.zeros(num_terms, num_outputs, dtype=torch.float64)
+    def __init__(self, num_terms: int, num_outputs: int, device: torch.device = CPU):
+        self._products = torch.zeros(num_terms, num_terms, dtype=torch.float64, device=device)
+        self._projections = torch.zeros(num_terms, num_outputs, dtype=torch.float64, device=device)
 
     def add(self, terms: Float[Tensor, "R P"], targets: Float[Tensor, "R C"]) -> None:
         """Add terms (R, P) and targets (R, C) to the equations."""
@@ -41,7 +43,7 @@ class NormalEquations:
             ConfigError: If the equations cannot be solved, e.g. for dependent terms without ridge.
         """
         size = len(self._products)
-        shift = ridge * self._products.diagonal().mean() * torch.eye(size, dtype=torch.float64)
+        shift = ridge * self._products.diagonal().mean() * torch.eye(size).to(self._products)
         factor, failed = torch.linalg.cholesky_ex(self._products + shift)
         if failed:
             raise ConfigError(
@@ -86,7 +88,7 @@ def fit_closed_form(
     if network is None:
         reach = asked.kernel_at(1.0, dataset.scene.dim).support_radius
         network = RadialNetSettings(layers=1, message="difference", relative_cutoff=reach)
-    samples = list(iterate_samples(dataset, "train", asked))
+    samples = FrameSamples(dataset, "train", asked)
     model = build_model(network, asked, asked.features if features is None else features, dataset.scene, samples)
     solve_closed_form(model, samples, ridge, progress)
     return model.eval()
@@ -116,14 +118,15 @@ def solve_closed_form(
         raise ConfigError(f"`ridge` must be at least 0, got {ridge}.")
     layer = model.network.linear_terms()
     equations: list[NormalEquations] = []
-    for sample in progress(samples):
+    for stored in progress(samples):
+        sample = stored.to(model.home)
         inputs = sample.inputs.double()
         terms = layer.terms(*model.network_inputs(inputs, model.geometry(inputs)))
         terms = [_answered(rows, inputs) for rows in terms]
         target = model.standardize_target(sample.target.double())
         targets, root = layer.targets(target), weight(target) ** 0.5
         if not equations:
-            equations = [NormalEquations(x.shape[1], y.shape[1]) for x, y in zip(terms, targets, strict=True)]
+            equations = [NormalEquations(x.shape[1], y.shape[1], x.device) for x, y in zip(terms, targets, strict=True)]
         for system, x, y in zip(equations, terms, targets, strict=True):
             system.add(root * x, root * y)
     layer.assign([system.solve(ridge) for system in equations])

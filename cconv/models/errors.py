@@ -44,7 +44,8 @@ def frame_errors(model: Model, samples: Iterable[Sample], geometry: Callable | N
     """
     geometry = geometry or (lambda sample: model.geometry(sample.inputs))
     errors = []
-    for sample in samples:
+    for stored in samples:
+        sample = stored.to(model.home)
         target = model.standardize_target(sample.target)
         errors.append(_frame_error(sample, model(sample.inputs, geometry(sample)), target))
     return errors

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from cconv.data.trajectory import Frame, ParticleType, Scene
 from cconv.data.window import Window
+from cconv.devices import FLOAT32, Precision, home_of, products_in
 from cconv.errors import ConfigError, ShapeError, shown
 from cconv.models.relaxation import Relaxation
 from cconv.models.standardization import Standardization, standardize_features, standardize_values, unknown
@@ -43,7 +44,7 @@ class ModelConfig(StrictModel):
     `wall_scalars` and `wall_vectors` are the numbers of features of a wall point, 0 without a convolution of the walls.
     `wall_types` are the types of the training data's wall particles, values of `ParticleType`, for a step task.
     `relaxation` is what rollouts of a step apply after every frame. `force_travel` is that of a step task to which the
-    integrator adds the external force, in particle spacings.
+    integrator adds the external force, in particle spacings. `precision` is that of the network's matrix products.
     """
 
     task: str
@@ -61,6 +62,7 @@ class ModelConfig(StrictModel):
     predictor: "ModelConfig | None" = None
     relaxation: Relaxation | None = None
     force_travel: Annotated[Real, Field(ge=0, le=1e6)] | None = None
+    precision: Precision = FLOAT32
 
     @model_validator(mode="after")
     def _names_are_known(self) -> "ModelConfig":
@@ -194,6 +196,16 @@ class Model(nn.Module):
         return model
 
     @property
+    def device(self) -> torch.device:
+        """Where the network computes."""
+        return self.target_mean.device
+
+    @property
+    def home(self) -> torch.device:
+        """Where the states of particles best stand: where the network computes, or the CPU if it needs float64."""
+        return home_of(self.device)
+
+    @property
     def num_parameters(self) -> int:
         """Number of learned values."""
         return sum(parameter.numel() for parameter in self.parameters())
@@ -219,6 +231,7 @@ class Model(nn.Module):
             ShapeError: If the frame has another dimension or other walls than the model.
         """
         self._check(inputs)
+        inputs = inputs.read_on(self.device)
         cutoff = self.settings.relative_cutoff
         points, index = inputs.positions, inputs.batch_index
         searches = [
@@ -248,7 +261,9 @@ class Model(nn.Module):
 
     def forward(self, inputs: Inputs, geometry: FrameGeometry) -> Float[Tensor, "M C"]:
         """Standardised prediction (M, C) for the particles that are asked about."""
-        values = self.network(*self.network_inputs(inputs, geometry))
+        inputs = inputs.read_on(self.device)
+        with products_in(self.config.precision, self.device):
+            values = self.network(*self.network_inputs(inputs, geometry)).to(self.target_mean.dtype)
         return values if inputs.answered is None else values[inputs.answered]
 
     def network_inputs(
@@ -267,7 +282,7 @@ class Model(nn.Module):
 
     def standardize_target(self, target: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """Target (N, C) in a sample's units to standardised values."""
-        return (target - self.target_mean) / self.target_scale
+        return (target.to(self.device) - self.target_mean) / self.target_scale
 
     @torch.no_grad()
     def predict(self, inputs: Inputs) -> Float[Tensor, "{inputs.num_answers} C"]:
@@ -276,12 +291,13 @@ class Model(nn.Module):
 
     def in_units_of_data(self, prediction: Float[Tensor, "M C"], inputs: Inputs) -> Float[Tensor, "M C"]:
         """Convert a standardised prediction (M, C) to the units of the data, and add what a predictor has answered."""
-        answer = (prediction * self.target_scale + self.target_mean) * self.task.unit(inputs.units)
+        standing = (prediction * self.target_scale + self.target_mean).to(inputs.positions.device)
+        answer = standing * self.task.unit(inputs.units)
         return answer if inputs.known is None else answer + inputs.known
 
     @torch.no_grad()
     def predict_frame(self, frame: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
-        """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data.
+        """Prediction (M, C) at the fluid particles of a frame of a data set, in the units of the data, where that is.
 
         Args:
             frame: A frame for a model of a field, a window up to the present frame for a model of a step.
@@ -291,7 +307,7 @@ class Model(nn.Module):
 
     def answer(self, observed: Frame | Window, scene: Scene) -> Float[Tensor, "M C"]:
         """`predict_frame`, differentiable."""
-        return self._answer(self.inputs(observed, scene))
+        return self._answer(self.inputs(observed.to(self.home), scene)).to(observed.device)
 
     def _answer(self, inputs: Inputs) -> Float[Tensor, "M C"]:
         return self.in_units_of_data(self(inputs, self.geometry(inputs)), inputs)
@@ -340,6 +356,7 @@ def build_model(
     scene: Scene,
     train_samples: Sequence[Sample],
     generator: torch.Generator | None = None,
+    precision: Precision = FLOAT32,
 ) -> Model:
     """A fresh model for a scene, standardised by its training samples only.
 
@@ -350,6 +367,7 @@ def build_model(
         scene: Scene of the samples.
         train_samples: Training split.
         generator: Source of the initial weights; None for torch's global one.
+        precision: That of the network's matrix products: "float32", "tf32" or "bfloat16".
 
     Raises:
         ConfigError: If the network would be too large, or a feature is unknown or missing.
@@ -374,10 +392,11 @@ def build_model(
         wall_types=_wall_types(train_samples[0]),
         network=network,
         predictor=None if predictor is None else predictor.config,
+        precision=precision,
     )
     # Shifted vectors would break the rotation equivariance of the network.
     turns = network.is_equivariant
-    taken = [sample.inputs.features.select(config.fluid_features) for sample in train_samples]
+    taken = (sample.inputs.features.select(config.fluid_features) for sample in train_samples)
     center = network.has_intercept(config.output) and not (turns and config.output.vectors)
     targets = standardize_values((sample.target for sample in train_samples), center)
     standardization = standardize_features(taken, center_vectors=not turns)

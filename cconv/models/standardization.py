@@ -25,22 +25,64 @@ class Standardization:
     scale: Float[Tensor, " C"]
 
 
+class Moments:
+    """Means and variances of columns over frames that are seen one at a time.
+
+    Source: Chan, Golub, LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances" (1979).
+    """
+
+    def __init__(self) -> None:
+        self._count, self._mean, self._squares = 0, torch.zeros(()), torch.zeros(())
+
+    def add(self, values: Float[Tensor, "N C"]) -> None:
+        """Take in the values (N, C) of a frame."""
+        values, count = values.double(), self._count + len(values)
+        if len(values) == 0:
+            return
+        mean = values.mean(dim=0)
+        squares, apart = (values - mean).square().sum(dim=0), mean - self._mean.to(mean)
+        self._squares = self._squares.to(mean) + squares + apart.square() * (self._count * len(values) / count)
+        self._mean = self._mean.to(mean) + apart * (len(values) / count)
+        self._count = count
+
+    @property
+    def mean(self) -> Float[Tensor, " C"]:
+        """Mean of each column."""
+        return self._mean
+
+    @property
+    def variance(self) -> Float[Tensor, " C"]:
+        """Variance of each column, of the values as a whole population."""
+        return self._squares / max(self._count, 1)
+
+    def standardization(self, columns: slice = slice(None), center: bool = True) -> Standardization:
+        """Standardisation of the vectors that some columns are the components of; arguments as `standardize_values`."""
+        mean, variance = self.mean[columns], self.variance[columns]
+        scale = variance.mean()
+        scale = torch.where(scale > 0, scale.sqrt(), 1.0)
+        return Standardization(mean if center else torch.zeros_like(mean), scale.expand(len(mean)).clone())
+
+
 def standardize_features(samples: Iterable[Features], center_vectors: bool = True) -> Standardization:
     """Standardisation of features over a training split, as `Features.flat` orders them.
 
     The constant stays as it is; the components of a vector share one scale, so that directions are kept.
 
     Args:
-        samples: Features of each frame.
+        samples: Features of each frame, seen once, one at a time.
         center_vectors: Whether the mean of vectors is subtracted; False for rotation-equivariant networks.
     """
-    frames = list(samples)
+    moments, seen = Moments(), None
+    for seen in samples:
+        moments.add(seen.flat())
+    assert seen is not None, "a training split has frames"
+    scalars, dim = len(seen.scalar_names), seen.vectors.shape[2]
     parts = []
-    for place, name in enumerate(frames[0].scalar_names):
+    for place, name in enumerate(seen.scalar_names):
         one = Standardization(torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64))
-        parts.append(one if name == CONSTANT else standardize_values(each.scalars[:, [place]] for each in frames))
-    for place in range(frames[0].kinds.vectors):
-        parts.append(standardize_values((each.vectors[:, place] for each in frames), center_vectors))
+        parts.append(one if name == CONSTANT else moments.standardization(slice(place, place + 1)))
+    for first in range(scalars, scalars + dim * seen.kinds.vectors, dim):
+        parts.append(moments.standardization(slice(first, first + dim), center_vectors))
     return Standardization(torch.cat([part.mean for part in parts]), torch.cat([part.scale for part in parts]))
 
 
@@ -51,14 +93,13 @@ def standardize_values(frames: Iterable[Float[Tensor, "N C"]], center: bool = Tr
     is the mean squared error divided by the variance. A constant field keeps scale 1.
 
     Args:
-        frames: Tensors (N, C), one a frame.
+        frames: Tensors (N, C), one a frame, seen once, one at a time.
         center: Whether the mean is subtracted; False for rotation-equivariant networks.
     """
-    stacked = torch.cat([values.double() for values in frames])
-    variance = stacked.var(dim=0, correction=0).mean()
-    scale = torch.where(variance > 0, variance.sqrt(), 1.0)
-    mean = stacked.mean(dim=0) if center else torch.zeros_like(stacked[0])
-    return Standardization(mean, scale.expand(stacked.shape[1]).clone())
+    moments = Moments()
+    for values in frames:
+        moments.add(values)
+    return moments.standardization(center=center)
 
 
 def unknown(kinds: Kinds, dim: int) -> Standardization:

@@ -37,10 +37,11 @@ from cconv.nn.continuous_conv import (
 )
 from cconv.nn.filters import WINDOWS, interpolate
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
-from cconv.ops import radial, radial_columns
+from cconv.ops import radial, radial_columns, recomputed
 from cconv.ops.convolution import columns, convolve
 from cconv.ops.filter_reads import FilterReads
 from cconv.ops.radial_columns import WeightedEdges
+from cconv.ops.recomputed import Block, Graph, by_blocks, stencil_of
 
 MESSAGES = {"absolute": (0, 0), "difference": (-1, -1), "sum": (1, 1), "mixed": (0, -1), "opposite": (1, -1)}
 
@@ -172,16 +173,30 @@ class RadialGeometry:
         Returns:
             For scalars s and r̂ · v, (E, S + V); for vectors s r̂, v and (r̂ · v) r̂, (D, E, S + 2V).
         """
-        scalars, vectors = (
-            values[self.senders] + own * values[self.receivers] if own else values[self.senders]
-            for values, own in zip(split_kinds(features, channels, self.dim), MESSAGES[message], strict=True)
-        )
-        along = torch.einsum("evd,ed->ev", vectors, self.directions)
-        directed = torch.cat([scalars, along], dim=1)[:, :, None] * self.directions[:, None, :]
-        to_scalars = torch.cat([scalars, along], dim=1)
-        # Directed scalars, vectors, directed projections.
-        to_vectors = torch.cat([directed[:, : channels.scalars], vectors, directed[:, channels.scalars :]], dim=1)
-        return to_scalars, to_vectors.permute(2, 0, 1)
+        own = _own_factors(channels, self.dim, message, features)
+        sent = features[self.senders] if own is None else features[self.senders] + own * features[self.receivers]
+        return _contributions(sent, self.directions, channels)
+
+
+def _own_factors(channels: Kinds, dim: int, message: str, like: Tensor) -> Float[Tensor, " C"] | None:
+    """What a receiver's own values (S + V · D) are multiplied by in a message; None where they are not read."""
+    of_scalars, of_vectors = MESSAGES[message]
+    if of_scalars == of_vectors == 0:
+        return None
+    return like.new_tensor([float(of_scalars)] * channels.scalars + [float(of_vectors)] * (channels.vectors * dim))
+
+
+def _contributions(
+    sent: Float[Tensor, "E C"], directions: Float[Tensor, "E D"], channels: Kinds
+) -> tuple[Float[Tensor, "E to_scalars"], Float[Tensor, "D E to_vectors"]]:
+    """What messages (E, S + V · D) contribute along directions (E, D) before the radial terms."""
+    scalars, vectors = split_kinds(sent, channels, directions.shape[1])
+    along = torch.einsum("evd,ed->ev", vectors, directions)
+    directed = torch.cat([scalars, along], dim=1)[:, :, None] * directions[:, None, :]
+    to_scalars = torch.cat([scalars, along], dim=1)
+    # Directed scalars, vectors, directed projections.
+    to_vectors = torch.cat([directed[:, : channels.scalars], vectors, directed[:, channels.scalars :]], dim=1)
+    return to_scalars, to_vectors.permute(2, 0, 1)
 
 
 class RadialConv(nn.Module):
@@ -239,6 +254,8 @@ class RadialConv(nn.Module):
         elif radial_columns.applies(features, geometry.weighted_edges):
             general = partial(self._convolve_generally, geometry=geometry)
             output = radial_columns.convolve(features, *filters, geometry.weighted_edges, own, general)
+        elif recomputed.applies(features):
+            output = self._convolve_by_blocks(features, *filters, geometry)
         else:
             output = self._convolve_generally(features, *filters, geometry)
         if self.bias is None:
@@ -274,6 +291,42 @@ class RadialConv(nn.Module):
             return scalars
         vectors = [convolve(component, vector_filters, geometry.reads) for component in to_vectors]
         return join_kinds(scalars, torch.stack(vectors, dim=2))
+
+    def _convolve_by_blocks(
+        self, features: Tensor, scalar_filters: Tensor, vector_filters: Tensor, geometry: RadialGeometry
+    ) -> Tensor:
+        """The same with a memory that grows with neither edges nor columns, on devices without compiled loops."""
+        kinds, dim, reads = self.in_channels, self.dim, geometry.reads
+        own = _own_factors(kinds, dim, self.message, features)
+        width = (kinds.scalars + kinds.vectors) + dim * (kinds.scalars + 2 * kinds.vectors)
+
+        def compute(
+            block: Block, sent: Tensor, received: Tensor, per_edge: Sequence[Tensor], filters: Sequence[Tensor]
+        ) -> Tensor:
+            directions, fractions, weights = per_edge
+            if own is not None:
+                sent = sent + (own * received).repeat_interleave(block.counts, 0, output_size=len(sent))
+            to_scalars, to_vectors = _contributions(sent, directions, kinds)
+            messages = torch.cat([to_scalars, *to_vectors.unbind(0)], dim=1)
+            columns = block.columns(messages, stencil_of(reads, block.edges, fractions, weights))
+            of_scalars, of_vectors = columns.split([to_scalars.shape[1], dim * to_vectors.shape[2]], dim=2)
+            scalars = of_scalars.flatten(1) @ filters[0].flatten(0, 1)
+            components = of_vectors.unflatten(2, (dim, to_vectors.shape[2])).transpose(1, 2).flatten(2)
+            return join_kinds(scalars, (components @ filters[1].flatten(0, 1)).transpose(1, 2))
+
+        def again(features: Tensor, per_edge: Sequence[Tensor], filters: Sequence[Tensor]) -> Tensor:
+            return self._convolve_generally(features, filters[0], filters[1], geometry)
+
+        return by_blocks(
+            compute,
+            features,
+            per_edge=(geometry.directions, reads.fractions, reads.weights),
+            shared=(scalar_filters, vector_filters),
+            graph=Graph(geometry.edges.row_splits, geometry.senders, own is not None),
+            values=(geometry.num_terms * width, geometry.num_terms + 2 * width),
+            outputs=self.out_channels.num_values(dim),
+            again=again,
+        )
 
     def _check(self, features: Tensor, geometry: RadialGeometry) -> None:
         if self.message != "absolute" and geometry.bipartite:

@@ -1,9 +1,9 @@
-"""The choice between the fast and the general path of a continuous convolution."""
+"""The choice among the paths of a continuous convolution, by where its tensors are and what is to be derived."""
 
 import torch
 from torch import Tensor
 
-from cconv.ops import blocked, general
+from cconv.ops import blocked, general, recomputed
 from cconv.ops.filter_reads import FilterReads
 from cconv.ops.workers import runs_compiled
 
@@ -20,6 +20,8 @@ def convolve(features: Tensor, filters: Tensor, reads: FilterReads, own: float =
     Returns:
         (N, C_out).
     """
+    if recomputed.applies(features):
+        return recomputed.convolve(features, filters, reads, own)
     path = blocked if _is_fast(features, reads) else general
     if _multiplies_first(reads, *filters.shape[1:]):
         return path.multiply_then_read(features, filters, reads, own)

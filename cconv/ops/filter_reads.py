@@ -70,11 +70,22 @@ class FilterReads:
 
     def corners(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Cell (E,), int64, and weight (E,) of each corner in turn."""
-        for corner, offset in enumerate(self.corner_offsets):
-            weights = self.weights
-            for axis, fraction in enumerate(self.fractions.unbind(1)):
-                weights = weights * (fraction if corner >> axis & 1 else 1 - fraction)
-            yield self.cells.long() + offset, weights
+        return corners(self.cells, self.fractions, self.weights, self.corner_offsets)
+
+    def with_weights(self, fractions: Tensor, weights: Tensor) -> "FilterReads":
+        """The same cells read with other fractions (E, A) and weights (E,)."""
+        return replace(self, fractions=fractions, weights=weights)
+
+
+def corners(
+    cells: Tensor, fractions: Tensor, weights: Tensor, corner_offsets: Sequence[int]
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Cell (E,), int64, and weight (E,) of each corner that edges read; arguments as of `FilterReads`."""
+    for corner, offset in enumerate(corner_offsets):
+        weight = weights
+        for axis, fraction in enumerate(fractions.unbind(1)):
+            weight = weight * (fraction if corner >> axis & 1 else 1 - fraction)
+        yield cells.long() + offset, weight
 
 
 def join_reads(parts: Sequence[FilterReads]) -> FilterReads:

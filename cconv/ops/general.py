@@ -1,6 +1,6 @@
 """Continuous convolution in torch operations: any device and dtype, differentiable any number of times in everything.
 
-The reference that the fast path is tested against, and the path on devices other than the CPU.
+The reference that the other paths are tested against, and the path of second derivatives and compiled graphs.
 """
 
 from torch import Tensor
@@ -36,7 +36,7 @@ def columns(features: Tensor, reads: FilterReads, own: float) -> Tensor:
     gathered = features.new_zeros(reads.num_receivers * reads.num_cells, features.shape[1])
     for cells, weights in reads.corners():
         gathered.index_add_(0, reads.receivers * reads.num_cells + cells, weights[:, None] * messages)
-    return gathered.reshape(reads.num_receivers, -1)
+    return gathered.reshape(reads.num_receivers, reads.num_cells * features.shape[1])
 
 
 def multiply_then_read(features: Tensor, filters: Tensor, reads: FilterReads, own: float) -> Tensor:

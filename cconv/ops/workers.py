@@ -17,11 +17,12 @@ import torch
 
 
 def runs_compiled(values: torch.Tensor) -> bool:
-    """Tell whether compiled loops take a tensor: they know the CPU and two precisions, and no graph can hold them."""
+    """Tell whether compiled loops take a tensor: they know the CPU and two precisions, no graph can hold them."""
     return (
         values.device.type == "cpu"
         and values.dtype in (torch.float32, torch.float64)
         and not torch.compiler.is_compiling()
+        and not torch.is_autocast_enabled("cpu")
     )
 
 

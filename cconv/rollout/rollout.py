@@ -150,7 +150,9 @@ def find_ends(window: Window, scene: Scene) -> list[Diverged | None]:
         Why each cannot be asked about; None where it can.
     """
     present, origins = window.present, window.origins
-    index = torch.zeros(len(present), dtype=torch.int64) if window.batch_index is None else window.batch_index
+    index = window.batch_index
+    if index is None:
+        index = torch.zeros(len(present), dtype=torch.int64, device=present.device)
     steps = window.last_displacements(scene.box).norm(dim=1) / scene.particle_spacing
     cells = torch.floor(present.double() / (2 * scene.particle_spacing)).long()
     broken = largest_of_windows((~torch.isfinite(present)).any(dim=1).long(), index, len(origins))

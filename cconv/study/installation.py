@@ -139,7 +139,7 @@ def _gpu() -> Checked:
     if not torch.cuda.is_available():
         return Checked("GPU", "note", "none; everything runs on the CPU")
     names = ", ".join(torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count()))
-    return Checked("GPU", "note", f"{names}; not used by the commands yet, which run on the CPU")
+    return Checked("GPU", "ok", f"{names}; `--device cpu` leaves it alone")
 
 
 def _animations() -> Checked:

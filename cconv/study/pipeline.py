@@ -7,8 +7,11 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from functools import cache
 from typing import cast
 
+import torch
+
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import dataset_findings, refuse_nonsense
+from cconv.devices import name_of
 from cconv.errors import ConfigError
 from cconv.study.declared.configuration import feature_path
 from cconv.study.declared.domains import SearchSpace, fixed
@@ -28,10 +31,12 @@ from cconv.study.running.private_folder import remove_left_behind
 from cconv.study.running.problem import (
     Problem,
     check_test_split,
+    device_of,
     load_problem,
     open_study_data,
     study_task,
     with_data_path,
+    with_device,
 )
 from cconv.study.running.serial_pool import SerialPool
 from cconv.study.running.training_logs import check_loggers
@@ -131,6 +136,16 @@ def move_data(run: RunFolder, path: str) -> None:
         write_study(run, study)
 
 
+def change_device(run: RunFolder, wish: str) -> None:
+    """Let a run go on on another device.
+
+    Raises:
+        ConfigError: If this machine does not have it, or another run works in the folder.
+    """
+    with run.locked():
+        write_study(run, with_device(recorded_study(run), wish))
+
+
 def write_study(run: RunFolder, study: StudyConfig) -> None:
     """Write study.json, with an id that tells the run from others of the same name in a database."""
     written = run.read("study.json") if (run.path / "study.json").is_file() else {"id": uuid.uuid4().hex[:8]}
@@ -155,7 +170,8 @@ def _session(
     serial: bool,
 ) -> Iterator[Session]:
     """Everything that the stages share; Ray starts when the first of them trains, and ends with the session."""
-    dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency)
+    device = device_of(study)
+    dataset = _described_data(study, run, observer, progress, 1 if serial else study.concurrency, device)
     task = study_task(study, dataset.scene, longest_history(space, study))
     check_test_split(study, dataset, task)
     if may_add_force(space, study):
@@ -186,12 +202,13 @@ def _session(
             start_pool=start_pool,
             count_cost=count_cost,
             progress=progress,
+            device=device,
             useless_error=problem.objective.of_mean_predictor(problem.valid_samples, problem.typical_samples),
         )
 
 
 def _described_data(
-    study: StudyConfig, run: RunFolder, observer: Observer, progress: Progress, workers: int
+    study: StudyConfig, run: RunFolder, observer: Observer, progress: Progress, workers: int, device: torch.device
 ) -> Dataset:
     """The data of a study; findings about them are told, and recorded with all else that a run depends on.
 
@@ -202,7 +219,7 @@ def _described_data(
     findings = dataset_findings(dataset, progress)
     refuse_nonsense(findings)
     observer.on_data([str(finding) for finding in findings])
-    described = describe_environment(study, dataset, workers)
+    described = describe_environment(study, dataset, workers, name_of(device))
     run.write("environment.json", described | {"data_findings": [finding.as_dict() for finding in findings]})
     return dataset
 

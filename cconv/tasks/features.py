@@ -36,7 +36,7 @@ def units_of_windows(state: "FluidState", scene: Scene) -> Units:
     counts = counts_of(state.batch_index)
     fluid = counts_of(state.fluid_batch_index, len(counts))
     units = [units_of(masses, scene) for masses in state.fluid_masses.split(fluid)]
-    return replace(units[0], density=spread_densities(units, counts))
+    return replace(units[0], density=spread_densities(units, state.batch_index))
 
 
 def features_in(names: Sequence[str], history: int) -> tuple[str, ...]:
@@ -184,7 +184,7 @@ class WindowState(FluidState):
     def wall_distances(self) -> Float[Tensor, " N"]:
         """Distance to the nearest wall point ÷ support radius of the kernel, at most 1, (N,); 0 for wall particles."""
         edges = self.wall_edges
-        nearest = torch.ones(edges.num_receivers, dtype=edges.distances.dtype)
+        nearest = edges.distances.new_ones(edges.num_receivers)
         nearest.scatter_reduce_(0, edges.receivers, edges.distances / edges.cutoff, "amin")
         distances = torch.zeros_like(self.masses)
         distances[self.is_fluid] = nearest
@@ -319,9 +319,9 @@ def _particle_features(state: FluidState, units: Units, names: Collection[str]) 
 
 
 def _wall_features(boundary: Boundary) -> Features:
-    points, dim = boundary.positions.shape
+    positions, (points, dim) = boundary.positions, boundary.positions.shape
     if boundary.normals is None:
-        ones, none = torch.ones(points, 1), torch.zeros(points, 0, dim)
+        ones, none = positions.new_ones(points, 1).float(), positions.new_zeros(points, 0, dim).float()
         return Features(scalars=ones, vectors=none, scalar_names=(CONSTANT,), vector_names=())
     normals = boundary.normals.float()[:, None, :]
-    return Features(scalars=torch.zeros(points, 0), vectors=normals, scalar_names=(), vector_names=(NORMAL,))
+    return Features(scalars=normals.new_zeros(points, 0), vectors=normals, scalar_names=(), vector_names=(NORMAL,))

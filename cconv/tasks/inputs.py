@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cconv.batching import counts_of, index_of
 from cconv.data.trajectory import Scene
+from cconv.devices import moved
 from cconv.domain import Box
 from cconv.errors import ShapeError
 from cconv.nn.kinds import Kinds, join_kinds, split_kinds
@@ -35,6 +36,10 @@ class Units:
     density: float | Float[Tensor, ""] | Float[Tensor, "N 1"]
     time: float | Float[Tensor, ""]
 
+    def to(self, device: torch.device) -> "Units":
+        """The same on a device."""
+        return moved(self, device, ("density",))
+
     @property
     def velocity(self) -> float | Tensor:
         """Spacings in a frame's time."""
@@ -54,10 +59,10 @@ def units_of(masses: Float[Tensor, " N"], scene: Scene) -> Units:
     )
 
 
-def spread_densities(units: Sequence[Units], counts: Sequence[int]) -> Float[Tensor, "N 1"]:
-    """Rest density of each particle (N, 1) of windows with so many particles, from the units of each window."""
-    densities = torch.tensor([each.density for each in units], dtype=torch.float64)
-    return densities.repeat_interleave(torch.tensor(counts))[:, None]
+def spread_densities(units: Sequence[Units], batch_index: Int[Tensor, " N"]) -> Float[Tensor, "N 1"]:
+    """Rest density of each particle (N, 1) of several windows, from the units of each window."""
+    densities = torch.tensor([each.density for each in units], dtype=torch.float64, device=batch_index.device)
+    return densities[batch_index][:, None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +134,9 @@ class Features:
             vector_names=tuple(self.vector_names[place] for place in vectors),
         )
 
-    def to(self, dtype: torch.dtype) -> "Features":
-        """The same in another type of numbers."""
-        return replace(self, scalars=self.scalars.to(dtype), vectors=self.vectors.to(dtype))
+    def to(self, to: torch.dtype | torch.device) -> "Features":
+        """The same in another type of numbers, or on a device."""
+        return replace(self, scalars=self.scalars.to(to), vectors=self.vectors.to(to))
 
     def separated(self, counts: Sequence[int]) -> list["Features"]:
         """Return the features of each of several windows with so many particles."""
@@ -202,6 +207,15 @@ class Inputs:
         """What a wall point carries; None without walls."""
         return None if self.wall_features is None else self.wall_features.kinds
 
+    def to(self, device: torch.device) -> "Inputs":
+        """The same on a device."""
+        return moved(self.read_on(device), device, ("units", "known"))
+
+    def read_on(self, device: torch.device) -> "Inputs":
+        """What a network reads on a device; units and a predictor's answer, for which it may lack float64, stay."""
+        points = ("positions", "features", "wall_positions", "wall_features")
+        return moved(self, device, (*points, "answered", "batch_index", "wall_batch_index"))
+
     def double(self) -> "Inputs":
         """The same in float64."""
         return replace(
@@ -218,7 +232,11 @@ class Inputs:
             return [self]
         counts = counts_of(self.batch_index)
         walls = self._separated_walls(len(counts))
-        densities = torch.as_tensor(self.units.density).expand(self.num_particles, 1).split(counts)
+        densities = (
+            torch.as_tensor(self.units.density, device=self.positions.device)
+            .expand(self.num_particles, 1)
+            .split(counts)
+        )
         answered = [None] * len(counts) if self.answered is None else self.answered.split(counts)
         known = [None] * len(counts) if self.known is None else self.known.split(self.answer_counts)
         parts = zip(
@@ -261,7 +279,7 @@ def join_inputs(parts: Sequence[Inputs]) -> Inputs:
     first = parts[0]
     if len(parts) == 1:
         return first
-    counts = [part.num_particles for part in parts]
+    index = index_of([part.num_particles for part in parts], first.positions.device)
     points = [part.wall_positions for part in parts if part.wall_positions is not None]
     of_points = [part.wall_features for part in parts if part.wall_features is not None]
     answered = [part.answered for part in parts if part.answered is not None]
@@ -272,9 +290,9 @@ def join_inputs(parts: Sequence[Inputs]) -> Inputs:
         features=join_features([part.features for part in parts]),
         wall_positions=torch.cat(points) if points else None,
         wall_features=join_features(of_points) if of_points else None,
-        units=replace(first.units, density=spread_densities([part.units for part in parts], counts)),
+        units=replace(first.units, density=spread_densities([part.units for part in parts], index)),
         answered=torch.cat(answered) if answered else None,
         known=torch.cat(known) if known else None,
-        batch_index=index_of(counts),
-        wall_batch_index=index_of([len(each) for each in points]) if points else None,
+        batch_index=index,
+        wall_batch_index=index_of([len(each) for each in points], points[0].device) if points else None,
     )

@@ -7,7 +7,8 @@ import torch
 from cconv.data.dataset import Dataset
 from cconv.data.plausibility import DataFinding
 from cconv.data.splits import evenly_spaced
-from cconv.data.trajectory import Trajectory
+from cconv.data.stored_frames import StoredFrames
+from cconv.data.trajectory import Frames, Scene
 from cconv.errors import ConfigError
 from cconv.tasks.samples import Sample, make_sample
 from cconv.tasks.task import FieldTask, Task
@@ -55,16 +56,14 @@ def field_findings(dataset: Dataset, tasks: Sequence[FieldTask]) -> list[DataFin
     Raises:
         DataError: If the data are damaged.
     """
-    chosen = [dataset.trajectory("train", k) for k in evenly_spaced(len(dataset.splits["train"]), FRAMES)]
+    chosen = [StoredFrames(dataset, "train", k) for k in evenly_spaced(len(dataset.splits["train"]), FRAMES)]
     return [finding for task in tasks for finding in _of_field(dataset, task, chosen)]
 
 
-def _of_field(dataset: Dataset, task: FieldTask, chosen: Sequence[Trajectory]) -> list[DataFinding]:
+def _of_field(dataset: Dataset, task: FieldTask, chosen: Sequence[Frames]) -> list[DataFinding]:
     """Findings about a field in the last frames of some trajectories, one of them if it cannot be computed there."""
     try:
-        samples = [
-            make_sample(each[-1], dataset.scene, task, each.name, each.first_frame + len(each) - 1) for each in chosen
-        ]
+        samples = [_last_sample(each, dataset.scene, task) for each in chosen]
     except ConfigError as error:
         text = f"the task {task.name!r} cannot be asked of these data: {error}"
         first = chosen[0]
@@ -72,6 +71,11 @@ def _of_field(dataset: Dataset, task: FieldTask, chosen: Sequence[Trajectory]) -
             DataFinding(check=_name(task), trajectory=first.name, frame=first.first_frame, particle=None, text=text)
         ]
     return target_findings(samples, task, stops=False)
+
+
+def _last_sample(frames: Frames, scene: Scene, task: FieldTask) -> Sample:
+    last = len(frames) - 1
+    return make_sample(frames[last], scene, task, frames.name, frames.first_frame + last)
 
 
 def _name(task: Task) -> str:

@@ -1,7 +1,7 @@
 """Samples: frames with what a network is given and what it has to answer."""
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from cconv.batching import groups_of
 from cconv.data.dataset import Dataset
+from cconv.data.stored_frames import KEPT_BYTES, StoredFrames, kept_trajectories
 from cconv.data.trajectory import Frame, Scene
 from cconv.data.window import Origin, Window, Windows
+from cconv.devices import moved
 from cconv.errors import check_choice
 from cconv.tasks.features import make_inputs
 from cconv.tasks.inputs import Inputs, join_inputs
@@ -48,6 +50,17 @@ class Sample:
         """Where the frame comes from, or each of several."""
         return self.joined or (Origin(self.trajectory, self.frame),)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is given and asked, bytes."""
+        inputs = self.inputs
+        given = (inputs.positions, inputs.features.scalars, inputs.features.vectors, inputs.wall_positions, self.target)
+        return sum(each.nbytes for each in given if each is not None)
+
+    def to(self, device: torch.device) -> "Sample":
+        """The same on a device."""
+        return moved(self, device, ("inputs", "target", "target_unit"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class StepSample(Sample):
@@ -62,6 +75,10 @@ class StepSample(Sample):
     window: Window
     scene: Scene
     task: StepTask
+
+    def to(self, device: torch.device) -> "StepSample":
+        """The same on a device."""
+        return moved(self, device, ("inputs", "target", "target_unit", "window"))
 
 
 def make_sample(frame: Frame, scene: Scene, task: FieldTask, trajectory: str = "", index: int = 0) -> Sample:
@@ -128,6 +145,51 @@ def _joined_sample(samples: Sequence[Sample]) -> Sample:
     )
 
 
+class FrameSamples(Sequence[Sample]):
+    """Samples of all frames of a split of a field, in order; the first ones stay in memory until that is full.
+
+    Others are made anew, and their frames read, whenever they are asked for. Nothing is evicted, as every sample
+    returns once in each epoch.
+
+    Args:
+        dataset: Data set.
+        split: "train", "valid" or "test".
+        task: What is asked.
+        most_bytes: Memory for samples.
+        progress: Wraps the numbers of the frames to show progress while the first ones are made.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        task: FieldTask,
+        most_bytes: int = KEPT_BYTES,
+        progress: Callable[[Iterable], Iterable] = iter,
+    ):
+        check_choice("split", split, dataset.splits)
+        self._scene, self._task = dataset.scene, task
+        self._frames = [StoredFrames(dataset, split, k) for k in range(len(dataset.splits[split]))]
+        self._places = [(frames, index) for frames in self._frames for index in range(len(frames))]
+        self._kept: list[Sample] = []
+        for number in progress(range(len(self._places))):
+            if most_bytes > 0:
+                self._kept.append(self[number])
+                most_bytes -= self._kept[-1].nbytes
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        if number < len(self._kept):
+            return self._kept[number]
+        frames, place = self._places[number]
+        return make_sample(frames[place], self._scene, self._task, frames.name, frames.first_frame + place)
+
+
 class WindowSamples(Sequence[StepSample]):
     """Samples of windows, each made when it is asked for, because windows share their frames and samples do not.
 
@@ -185,7 +247,9 @@ def learned_samples(dataset: Dataset, split: str, task: StepTask, further: int =
         DataError: If a trajectory is too short for a single window.
     """
     check_choice("split", split, dataset.splits)
-    return WindowSamples(Windows(dataset.trajectories(split), task.history, 1, further=further), dataset.scene, task)
+    return WindowSamples(
+        Windows(kept_trajectories(dataset, split), task.history, 1, further=further), dataset.scene, task
+    )
 
 
 def rolled_samples(dataset: Dataset, split: str, task: StepTask, horizon: int) -> WindowSamples:
@@ -201,11 +265,17 @@ def rolled_samples(dataset: Dataset, split: str, task: StepTask, horizon: int) -
         DataError: If a trajectory is too short for a single one.
     """
     check_choice("split", split, dataset.splits)
-    windows = Windows(dataset.trajectories(split), task.history, horizon, stride=task.history + horizon)
+    windows = Windows(kept_trajectories(dataset, split), task.history, horizon, stride=task.history + horizon)
     return WindowSamples(windows, dataset.scene, task)
 
 
-def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HORIZON) -> Iterable[Sample]:
+def compared_samples(
+    dataset: Dataset,
+    split: str,
+    task: Task,
+    horizon: int = HORIZON,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> Sequence[Sample]:
     """Samples of a split that models are compared by: all frames of a field, or windows that rollouts begin with.
 
     Args:
@@ -213,15 +283,13 @@ def compared_samples(dataset: Dataset, split: str, task: Task, horizon: int = HO
         split: "train", "valid" or "test".
         task: What is asked.
         horizon: Frames of each rollout of a step task.
+        progress: Wraps the numbers of the frames of a field to show progress while their samples are made.
     """
     if isinstance(task, StepTask):
         return rolled_samples(dataset, split, task, horizon)
-    return iterate_samples(dataset, split, as_field(task))
+    return FrameSamples(dataset, split, as_field(task), progress=progress)
 
 
 def iterate_samples(dataset: Dataset, split: str, task: FieldTask) -> Iterator[Sample]:
-    """Samples of all frames of a split, in order."""
-    check_choice("split", split, dataset.splits)
-    for trajectory in dataset.trajectories(split):
-        for index, frame in enumerate(trajectory):
-            yield make_sample(frame, dataset.scene, task, trajectory.name, trajectory.first_frame + index)
+    """Samples of all frames of a split, in order, one at a time; none stays in memory."""
+    return iter(FrameSamples(dataset, split, task, most_bytes=0))

@@ -52,8 +52,9 @@ class StoredExamples:
     ) -> list[Sample]:
         """Return samples; arguments as of `Examples.draw`."""
         if isinstance(self.samples, WindowSamples):
-            return _step_samples([self.samples.window(index) for index in indices], self.samples, model, steps)
-        return join_samples([self.samples[index] for index in indices])
+            windows = [self.samples.window(index).to(model.home) for index in indices]
+            return _step_samples(windows, self.samples, model, steps)
+        return join_samples([self.samples[index].to(model.home) for index in indices])
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ class AugmentedExamples:
     ) -> list[Sample]:
         """Return samples of windows that were changed for this update; arguments as of `Examples.draw`."""
         scene, changed = self.samples.scene, [self._changed(index, update, share) for index in indices]
-        windows = pushed(model, [window for window, _ in changed], scene, [count for _, count in changed])
+        windows = [window.to(model.home) for window, _ in changed]
+        windows = pushed(model, windows, scene, [count for _, count in changed])
         return _step_samples(windows, self.samples, model, steps)
 
     def _changed(self, index: int, update: int, share: float) -> tuple[Window, int]:

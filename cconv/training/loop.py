@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cconv.devices import FLOAT32, TF32, Precision, products_in
 from cconv.errors import check_choice
 from cconv.models.model import FrameGeometry, Model
 from cconv.tasks.samples import Sample
@@ -182,7 +183,11 @@ def _update(
     frames, total = sum(len(sample.origins) for sample in batch), 0.0
     for sample in batch:
         loss = torch.stack(losses_of(model, sample, geometry, loss_of, steps)).sum() / frames
-        loss.backward()
+        of_backward: Precision = (
+            TF32 if model.config.precision == TF32 else FLOAT32
+        )  # autocast is only for the way forward
+        with products_in(of_backward, model.device):
+            loss.backward()
         total += loss.item()
     if math.isfinite(total):
         optimizer.step()

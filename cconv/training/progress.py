@@ -57,7 +57,8 @@ def save_progress(path: Path, model: Model, progress: Progress) -> None:
     averages = {} if progress.average is None else progress.average.state_dict()
     tensors |= {f"average.{name}": value for name, value in averages.items()}
     with replacing(path) as part:
-        save_file({name: value.contiguous() for name, value in tensors.items()}, part, {"counts": json.dumps(counts)})
+        stored = {name: value.cpu().contiguous() for name, value in tensors.items()}
+        save_file(stored, part, {"counts": json.dumps(counts)})
 
 
 def load_progress(path: Path, model: Model) -> Progress:
@@ -78,6 +79,7 @@ def load_progress(path: Path, model: Model) -> Progress:
         for name, parameter in model.named_parameters():
             if f"adam.step.{name}" in tensors:  # a parameter that no loss depends on has no moments
                 moments = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+                moments |= {key: moments[key].to(parameter.device) for key in ("exp_avg", "exp_avg_sq")}
                 if not all(moments[key].shape == parameter.shape for key in ("exp_avg", "exp_avg_sq")):
                     raise ValueError(f"moments of {name} have another shape")
                 progress.optimizer.state[parameter] = moments

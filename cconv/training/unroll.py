@@ -109,8 +109,8 @@ def _answers(
     model: Model, sample: Sample, prediction: Tensor, seen: FrameGeometry, numbers: Sequence[int]
 ) -> list[Answered]:
     """Answers about windows with some numbers."""
-    counts, answered = sample.inputs.answer_counts, sample.inputs.answered
-    neighbors = seen.fluid.neighbor_counts if answered is None else seen.fluid.neighbor_counts[answered]
+    counts, answered, neighbors = sample.inputs.answer_counts, sample.inputs.answered, seen.fluid.neighbor_counts
+    neighbors = neighbors if answered is None else neighbors[answered.to(neighbors.device)]
     parts = prediction.split(counts), model.standardize_target(sample.target).split(counts), neighbors.split(counts)
     return [Answered(*each) for each in zip(numbers, *parts, strict=True)]
 

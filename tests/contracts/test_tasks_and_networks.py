@@ -1,12 +1,14 @@
 """What every pair of a task and a network must hold; a new one is held to it by being in its folder's list."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 from typing import get_args
 
 import pytest
 import torch
 from contracts.registered import registered
+from simulated_device import simulated_device
 from systems import configured, model_of, observed_and_sample, periodic_frame, periodic_scene, with_walls
 
 from cconv.data.trajectory import Boundary, Frame
@@ -157,3 +159,30 @@ def test_optional_features_can_be_left_out(task, architecture, generator):
         model = build_model(settings, asked, features, scene, [sample], generator)
         assert left_out not in model.config.features
         assert model.predict_frame(observed, scene).shape == (64, asked.output.num_values(2))
+
+
+@pairs
+def test_any_device_gives_the_same_answers_and_gradients(task, architecture, generator):
+    """A checkpoint made on one device answers on another, and learns there what it would have learned here."""
+    model, observed, scene = fresh(task, architecture, generator)
+    expected, learned = model.predict_frame(observed, scene), gradients(model, observed, scene)
+    with simulated_device() as device:
+        away = deepcopy(model).to(device)
+        assert away.device == away.home == device
+        close(away.predict_frame(observed, scene), expected)
+        here = away.predict_frame(observed.to(device), scene)
+        assert here.device == device
+        close(here.cpu(), expected)
+        found = {name: each.cpu() for name, each in gradients(away, observed.to(device), scene).items()}
+    assert found.keys() == learned.keys()
+    for name, gradient in learned.items():
+        torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-4 * float(gradient.abs().max()) + 1e-9)
+
+
+def gradients(model, observed, scene):
+    """Gradients of a loss by the names of the parameters."""
+    model.zero_grad()
+    model.answer(observed, scene).square().sum().backward()
+    return {
+        name: each.grad.clone() for name, each in model.named_parameters() if each.grad is not None and each.numel()
+    }

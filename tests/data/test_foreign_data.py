@@ -78,7 +78,10 @@ def with_missing_filter(group, folder):
         (half_written, "not written from frame 4 on"),
         (with_missing_filter, "filter 32001"),
         (lambda group, folder: group.create_dataset("position", SHAPE, "f4"), "never written"),
-        (lambda group, folder: group.create_dataset("position", (10**6, 10**6, 2), "f4"), "8 TB, more than"),
+        (
+            lambda group, folder: group.create_dataset("position", (10**6, 10**6, 2), "f4"),
+            "8 TB but only 0 bytes",
+        ),
         (lambda group, folder: group.create_dataset("position", (10**4, 4000, 2), "f4"), "320 MB but only"),
         (lambda group, folder: group.create_dataset("position", data=np.zeros(SHAPE, "g")), "float64"),
         (lambda group, folder: group.create_dataset("position", data=np.zeros(SHAPE, "c8")), "must be numbers"),

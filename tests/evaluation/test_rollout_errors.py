@@ -73,7 +73,7 @@ def test_only_steps_can_be_rolled_out(generator):
 
 def test_units_are_trajectories_or_single_rollouts(generator):
     class Replay:
-        task = TASK
+        task, home = TASK, torch.device("cpu")
         predict_frame = staticmethod(TASK.target)
 
     alone = begun(generator, 3)
@@ -86,7 +86,7 @@ def test_units_are_trajectories_or_single_rollouts(generator):
 
 def test_mse5_is_the_mean_of_the_first_five_frames_where_there_are_five(generator):
     class Pushed:
-        task = TASK
+        task, home = TASK, torch.device("cpu")
 
         @staticmethod
         def predict_frame(window, scene):

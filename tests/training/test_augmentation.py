@@ -15,7 +15,8 @@ from cconv.training.unroll import Pushforward
 
 TASK, SCENE = task_named("acceleration"), periodic_scene(40)
 NOISE, NEVER = RandomWalkNoise(0.05), Pushforward(0, 0)
-MODEL = SimpleNamespace(task=TASK, predict_frame=TASK.target, config=SimpleNamespace(features=TASK.features))
+CONFIG, CPU = SimpleNamespace(features=TASK.features), torch.device("cpu")
+MODEL = SimpleNamespace(task=TASK, predict_frame=TASK.target, config=CONFIG, home=CPU)
 
 
 def noisy_and_clean(generator):

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
 from systems import configured, model_of, periodic_frame, periodic_scene, window_of, with_walls
 
 from cconv.data.trajectory import ParticleType
+from cconv.devices import CPU
 from cconv.forces import ConstantForce
 from cconv.models.model import join_geometries
 from cconv.tasks import TASKS, task_named
@@ -70,10 +72,10 @@ def in_double(sample):
 def one_graph(task, frames, steps=1):
     """The same in one graph, as trainings join them."""
     if isinstance(task, StepTask):
-        model = type("Takes", (), {"config": type("Config", (), {"features": task.features})})
+        model = SimpleNamespace(config=SimpleNamespace(features=task.features), home=CPU)
         (joined,) = StoredExamples(WindowSamples(frames, SCENE, task)).draw(range(len(frames)), 1, model, steps)
     else:
-        (joined,) = StoredExamples(samples_of(task, frames)).draw(range(len(frames)), 1, None)
+        (joined,) = StoredExamples(samples_of(task, frames)).draw(range(len(frames)), 1, SimpleNamespace(home=CPU))
     return joined
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cconv.data.arrays import ParticleArrays, SceneFacts, split_runs, write_runs
+from cconv.data.folders import check_room
+from cconv.data.hdf5 import LEAST_COMPRESSED
 from cconv.data.importing.conversion import AXES
 from cconv.data.importing.facts import GIVEN, IN_FILES, axes_of, box_of, frame_dt_of, on_axes, spacing_of
 from cconv.data.importing.masses import Masses
@@ -33,6 +35,7 @@ class ImportPlan:
         runs: Name of the run of each trajectory.
         scene: What they share.
         settings: What the user said.
+        least_bytes: Bytes that the data set takes at least.
     """
 
     found: dict[str, str]
@@ -41,9 +44,11 @@ class ImportPlan:
     runs: tuple[str, ...]
     scene: SceneFacts
     settings: ImportSettings
+    least_bytes: int
 
     def write(self, folder: Path, overwrite: bool, progress: Progress) -> None:
-        """Write the data set; errors as of `cconv.data.arrays.write_dataset`."""
+        """Write the data set; errors as of `cconv.data.arrays.write_dataset`, and `ConfigError` on too small a disk."""
+        check_room(folder, self.least_bytes)
         split = (self.settings.split_fractions, self.settings.gap, self.settings.data_seed)
         write_runs(folder, self.trajectories, self.scene, self.runs, split, overwrite, progress)
 
@@ -100,7 +105,10 @@ def plan_import(
         "converted": settings.conversion.text or "nothing: units and axes are those of the files",
         "written as": trajectories.description,
     }
-    return ImportPlan(found, missing, trajectories, trajectories.runs, scene, settings)
+    positions = 4 * len(axes) * sum(sum(scan.counts) for scan in scans)  # bytes, uncompressed
+    return ImportPlan(
+        found, missing, trajectories, trajectories.runs, scene, settings, int(LEAST_COMPRESSED * positions)
+    )
 
 
 def _check_enough(runs: Sequence[Run], settings: ImportSettings) -> None:

@@ -10,7 +10,13 @@ from cconv.models.model import Model
 
 
 class Predictor(Protocol):
-    """Interface of a predictor of the field of a frame."""
+    """Interface of a predictor of the field of a frame.
+
+    Attributes:
+        precision: What its products of matrices are computed in.
+    """
+
+    precision: str
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
         """Predict the field (N, C) at the fluid particles in the precision of normal use."""
@@ -27,7 +33,8 @@ class ModelPredictor:
     """
 
     def __init__(self, model: Model):
-        self._model, self._exact = model, deepcopy(model).double()
+        self.precision = model.config.precision
+        self._model, self._exact = model, deepcopy(model).to(model.home).double()
 
     def predict(self, frame: Frame, scene: Scene) -> Tensor:
         """Field (N, C) in the units of the data, as `Model.predict_frame`."""

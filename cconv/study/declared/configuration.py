@@ -5,6 +5,7 @@ from typing import Annotated, Literal, NamedTuple, TypeVar, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from cconv.devices import AUTO, FLOAT32, WISH, Precision
 from cconv.errors import ConfigError, did_you_mean, shown
 from cconv.models.relaxation import Relaxation
 from cconv.networks import ARCHITECTURES, ConvNetSettings
@@ -14,7 +15,7 @@ from cconv.study.declared.paths import below
 from cconv.tasks import TASKS
 from cconv.tasks.features import CONSTANT
 from cconv.tasks.task import StepTask
-from cconv.validation import Horizon, Length, OneOf, Real, StrictModel, Value, Whole
+from cconv.validation import Flag, Horizon, Length, OneOf, Real, StrictModel, Value, Whole
 
 MOST_UPDATES = 10**9
 MOST_UNROLLED = 10  # steps that an update differentiates through, whose states are all kept in memory
@@ -34,13 +35,14 @@ HYPERPARAMETERS = (
     EXTERNAL_FORCE,
     *(f"{FEATURES}.{name}" for name in OPTIONAL_FEATURES),
     *(f"{TRAINING}.{name}" for name in ("batch_size", "learning_rate", "schedule", "loss", "average")),
-    *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll")),
+    *(f"{TRAINING}.{name}" for name in ("noise", "pushforward", "unroll", "precision")),
     *(f"{RELAXATION}.{name}" for name in Relaxation.model_fields),
 )
 
 Settings = TypeVar("Settings", bound=StrictModel)
 Updates = Annotated[Whole, Field(ge=1, le=MOST_UPDATES)]
 Noise = Annotated[Real, Field(ge=0, le=1)]  # standard deviation of the last velocity's, particle spacings per frame
+Device = Annotated[str, Field(pattern=rf"^({WISH.pattern})$")]
 SquaredLoss = Literal["mse", "balanced_mse"]
 Loss = Literal["mse", "balanced_mse", "neighbor_weighted"]
 
@@ -117,6 +119,10 @@ class TrainingConfig(StrictModel):
     it then learns from at once, with gradients through all of them, once a share `unroll_from` of it is spent.
     `average` is the decay of a moving average of the weights, which is evaluated and kept in their place; 0 keeps the
     weights themselves.
+
+    `device` is where models are trained, compared and timed; "auto" takes the first NVIDIA GPU, or else the CPU.
+    `precision` is that of the products of matrices in the network. `deterministic` gives the same bits every time on a
+    GPU too.
     """
 
     updates: Updates = 600
@@ -133,6 +139,9 @@ class TrainingConfig(StrictModel):
     unroll_from: Real = Field(0.5, ge=0, le=1)
     average: Real = Field(0.0, ge=0, lt=1)
     cache_megabytes: Whole = Field(2048, ge=0, le=2**20)
+    device: Device = AUTO
+    precision: Precision = FLOAT32
+    deterministic: Flag = False
 
     @property
     def budget(self) -> str:

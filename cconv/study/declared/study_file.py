@@ -64,7 +64,8 @@ class SearchConfig(StrictModel):
     `baseline` gives hyperparameters of the baseline other values than the space does.
     A trial whose validation error exceeds `give_up_above` at an evaluation is stopped. One that has trained for
     `trial_seconds` is stopped at its next update, and its process ended if it hangs. `concurrency` None means as many
-    trials at once as cores.
+    trials at once as cores. `gpu_share` is the part of a GPU that each takes where they train on GPUs; None divides all
+    GPUs among the trials at once.
     """
 
     space: PathText
@@ -74,6 +75,7 @@ class SearchConfig(StrictModel):
     give_up_above: Real = Field(10.0, ge=1e-12, le=1e9)
     trial_seconds: Real = Field(3600.0, ge=1e-3, le=1e7)
     concurrency: Whole | None = Field(None, ge=1, le=4096)
+    gpu_share: Real | None = Field(None, ge=1e-3, le=64)
 
     @field_validator("baseline", mode="before")
     @classmethod

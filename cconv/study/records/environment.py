@@ -14,7 +14,7 @@ from cconv.study.declared.study_file import StudyConfig
 PACKAGES = ("cconv", "torch", "numpy", "scipy", "ray", "optuna", "h5py", "pandas", "pydantic")
 
 
-def describe_environment(study: StudyConfig, dataset: Dataset, trials_at_once: int) -> dict:
+def describe_environment(study: StudyConfig, dataset: Dataset, trials_at_once: int, device: str) -> dict:
     """Describe the provenance of a run, the content of environment.json."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -25,7 +25,7 @@ def describe_environment(study: StudyConfig, dataset: Dataset, trials_at_once: i
         "platform": platform.platform(),
         "processor": _processor(),
         "cores": os.cpu_count(),
-        "device": "cpu",
+        "device": device,
         "threads": {"training": 1, "cost": study.cost.threads, "trials_at_once": trials_at_once},
         "seeds": study.seeds.model_dump(),
         "data": {"path": str(dataset.path), "sha256": dataset.fingerprint()},

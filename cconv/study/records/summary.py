@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from cconv.study.records.forms import Count, NonNegative
 from cconv.study.records.found import Interval, Parts
-from cconv.validation import Flag, Id, InnerPath, Name, PathText, Real, StrictModel, Value
+from cconv.validation import Flag, Id, InnerPath, Name, PathText, Real, StrictModel, Text, Value
 
 
 class TaskFacts(StrictModel):
@@ -108,6 +108,7 @@ class ModelCost(AnalyticCost):
         flops_per_particle: Operations of a prediction per particle.
         threads: Number of threads of the measurement.
         num_particles: Mean number of particles of a frame.
+        device: Where it was timed; the analytic field and a solver always run on the CPU.
     """
 
     us_per_particle: NonNegative
@@ -115,6 +116,7 @@ class ModelCost(AnalyticCost):
     flops_per_particle: NonNegative
     threads: Count
     num_particles: NonNegative
+    device: Text = "cpu"
 
 
 class SizeTime(FrameTime):

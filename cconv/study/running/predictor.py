@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from cconv.devices import CPU, home_of
 from cconv.models.checkpoint import load_model, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import TrainingConfig
 from cconv.study.declared.study_file import PredictorConfig, StudyConfig
-from cconv.study.running.problem import Problem, provenance
+from cconv.study.running.problem import Problem, device_of, provenance
 
 Progress = Callable[[Iterable, str], Iterable]
 
@@ -43,7 +44,7 @@ def _fitted(problem: Problem, study: StudyConfig, asked: PredictorConfig, progre
     alone = study.configuration._replace(
         network=asked.network, training=training, with_predictor=False, relaxation=None
     )
-    model = problem.build_model(alone, study.seeds.init)
+    model = problem.build_model(alone, study.seeds.init).to(home_of(device_of(study)))
     places = progress(range(len(problem.train_samples)), "fit the predictor")
     problem.solve_closed_form(model, training, places, asked.ridge, study.seeds.data)
-    return model.eval()
+    return model.eval().to(CPU)  # whence it is sent to other processes

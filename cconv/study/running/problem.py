@@ -12,6 +12,7 @@ from cconv.data.metadata import OVERRIDES
 from cconv.data.smoothed_force import travel_deviation
 from cconv.data.trajectory import Scene
 from cconv.data.window import check_length
+from cconv.devices import find_device
 from cconv.errors import ConfigError
 from cconv.evaluation.objectives import Objective, objective_of
 from cconv.models.closed_form import solve_closed_form
@@ -23,10 +24,10 @@ from cconv.tasks.external_force import force_to_add
 from cconv.tasks.features import features_in
 from cconv.tasks.samples import (
     HORIZON,
+    FrameSamples,
     Sample,
     StepSample,
     WindowSamples,
-    iterate_samples,
     learned_samples,
     rolled_samples,
 )
@@ -158,6 +159,7 @@ class Problem:
             self.scene,
             self._typical(task),
             torch.Generator().manual_seed(init_seed),
+            configuration.training.precision,
         )
         return model if configuration.relaxation is None else model.relaxed_by(configuration.relaxation)
 
@@ -193,6 +195,25 @@ def with_data_path(study: StudyConfig, path: str) -> StudyConfig:
     return study.model_copy(update={"data": study.data.model_copy(update={"path": path})})
 
 
+def with_device(study: StudyConfig, wish: str) -> StudyConfig:
+    """Return the study with another wish for a device.
+
+    Raises:
+        ConfigError: If this machine does not have it.
+    """
+    find_device(wish)
+    return study.model_copy(update={"training": study.training.model_copy(update={"device": wish})})
+
+
+def device_of(study: StudyConfig) -> torch.device:
+    """Find the device of a study on this machine.
+
+    Raises:
+        ConfigError: If this machine does not have it.
+    """
+    return find_device(study.training.device, "training.device")
+
+
 def study_samples(
     study: StudyConfig, dataset: Dataset, split: str, task: Task, progress: Progress = lambda items, _: items
 ) -> Sequence[Sample]:
@@ -206,7 +227,7 @@ def study_samples(
         progress: Wraps an iterable to show progress, given a label.
     """
     if not isinstance(task, StepTask):
-        return list(progress(iterate_samples(dataset, split, as_field(task)), split))
+        return FrameSamples(dataset, split, as_field(task), progress=lambda numbers: progress(numbers, split))
     if split == "train":
         return learned_samples(dataset, split, task, further=MOST_PUSHED)
     return rolled_samples(dataset, split, task, _horizon(study))

@@ -40,7 +40,7 @@ from cconv.study.running.private_ray import (  # noqa: E402
     on_loopback_alone,
     token_of_this_run,
 )
-from cconv.study.running.problem import Problem  # noqa: E402
+from cconv.study.running.problem import Problem, device_of  # noqa: E402
 from cconv.study.running.recorded_training import DISK_FULL, disk_is_full, record_what_failed, train_recorded  # noqa: E402
 from cconv.study.running.trial_queue import Job, TrialQueue  # noqa: E402
 
@@ -65,14 +65,17 @@ def ray_pool(study: StudyConfig, problem: Problem, folder: Path, address: str | 
     folder = folder.absolute()
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        stack.enter_context(private_ray(study.concurrency) if address is None else _cluster(address))
+        wish, gpus = _place(study)
+        stack.enter_context(private_ray(study.concurrency, gpus) if address is None else _cluster(address))
         ray._private.worker._worker_logs_enabled = False  # our records say which training died
-        yield RayPool(study, problem, folder)
+        yield RayPool(_with_wish(study, wish), problem, folder, gpus)
 
 
 @contextmanager
-def private_ray(cores: int) -> Iterator[None]:
-    """Start a Ray on this machine for so many trainings at once; it listens on loopback only and demands a token.
+def private_ray(cores: int, gpus: int = 0) -> Iterator[None]:
+    """Start a Ray on this machine for so many trainings at once, which share so many GPUs.
+
+    It listens on loopback only and demands a token.
 
     Raises:
         ConfigError: If it cannot start.
@@ -80,7 +83,7 @@ def private_ray(cores: int) -> Iterator[None]:
     demand_tokens()
     with private_folder() as own, token_of_this_run(own), on_loopback_alone():
         try:
-            _start(cores, own)
+            _start(cores, gpus, own)
             yield
         finally:
             ray.shutdown()
@@ -97,12 +100,12 @@ def _cluster(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def _start(cores: int, folder: Path) -> None:
+def _start(cores: int, gpus: int, folder: Path) -> None:
     """Start a Ray on this machine whose files are in `folder`."""
     settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES, "_temp_dir": str(folder / "ray")}
     for left in reversed(range(STARTS)):
         try:
-            ray.init("local", num_cpus=cores, **settings, **QUIET)
+            ray.init("local", num_cpus=cores, num_gpus=gpus, **settings, **QUIET)
             return
         except Exception as error:  # Ray has no class for a start that takes too long
             ray.shutdown()
@@ -143,10 +146,11 @@ class RayPool:
         study: The study.
         problem: Scene, task and samples; sent to every node once.
         folder: Folder of Ray's own files, which are not read again; on a cluster, on the storage that all nodes share.
+        gpus: GPUs of this machine that trainings share by Ray; 0 where they need none, or name the one they take.
     """
 
-    def __init__(self, study: StudyConfig, problem: Problem, folder: Path):
-        self._study, self._folder = study, folder
+    def __init__(self, study: StudyConfig, problem: Problem, folder: Path, gpus: int = 0):
+        self._study, self._folder, self._gpus = study, folder, gpus
         self._shared = ray.put((study, problem))
 
     @property
@@ -159,6 +163,12 @@ class RayPool:
         """Number of trainings at the same time that share the memory of a node."""
         return min(self.concurrency, max(_cores_by_node()))
 
+    @property
+    def _gpu_share(self) -> float:
+        """Part of a GPU that a training takes: as the study says, or such that all trainings at once find room."""
+        at_once = -(-self.concurrency // self._gpus)
+        return self._study.search.gpu_share or 1 / at_once
+
     def run(self, queue: TrialQueue, stage: str, training: TrainingConfig) -> None:
         """Train every job of a queue to the full budget of `training`, unless it is stopped before.
 
@@ -166,14 +176,16 @@ class RayPool:
             ConfigError: If the disk is full; the records stay, and the stage can be resumed.
         """
         shared, cache = self._shared, training.cache_megabytes // self.concurrency_of_a_node
-        training = training.model_copy(update={"cache_megabytes": cache})
+        update = {"cache_megabytes": cache, "device": self._study.training.device}
+        training = training.model_copy(update=update)
+        resources = {"cpu": 1, "gpu": self._gpu_share} if self._gpus else {"cpu": 1}
 
         def trainable(config: dict) -> None:
             _train_and_report(config["job"], stage, training, *ray.get(shared))
 
         driver = _Driver(queue, stage)
         tuner = tune.Tuner(
-            tune.with_resources(trainable, {"cpu": 1}),
+            tune.with_resources(trainable, resources),
             tune_config=tune.TuneConfig(
                 num_samples=-1,
                 max_concurrent_trials=self.concurrency,
@@ -198,6 +210,21 @@ class RayPool:
             raise driver.error or error from None
         if driver.error:
             raise driver.error
+
+
+def _place(study: StudyConfig) -> tuple[str, int]:
+    """Wish for a device that a training has in its own process, and the GPUs that Ray shares out among trainings.
+
+    Ray shows each process only its GPU, which is then the first one. A GPU that the study names is taken as it is.
+    """
+    device = device_of(study)
+    if device.type != "cuda" or study.training.device.startswith("cuda:"):
+        return str(device), 0
+    return "cuda", torch.cuda.device_count()
+
+
+def _with_wish(study: StudyConfig, wish: str) -> StudyConfig:
+    return study.model_copy(update={"training": study.training.model_copy(update={"device": wish})})
 
 
 def _cores_by_node() -> list[int]:

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from typing import Any
 
+from cconv.devices import find_device, name_of, repeatable
 from cconv.evaluation.cost import flops_per_particle
 from cconv.models.checkpoint import read_card, save_model
 from cconv.models.model import Model
@@ -67,7 +68,7 @@ def run_trial(
     """
     configuration = configure(trial.parameters, defaults)
     training = configuration.training
-    model = problem.build_model(configuration, trial.init_seed)
+    model = _on_its_device(problem.build_model(configuration, trial.init_seed), training)
     config = describe(problem, trial, model, training)
     progress = _begin_or_go_on(model, folder, config)
     card = config | dict(trial.provenance)
@@ -82,7 +83,7 @@ def run_trial(
         progress=progress,
     )
     try:
-        with _logs(trial, folder, config) as logs:
+        with repeatable(training.deterministic), _logs(trial, folder, config) as logs:
             for state in states:
                 on_update(state)
                 if state.valid_error is None and not state.diverged:
@@ -125,11 +126,16 @@ def describe(problem: Problem, trial: Trial, model: Model, training: TrainingCon
         "window": problem.task.history,
         "network": model.settings.model_dump(),
         "training": training.model_dump(),
+        "device": name_of(model.device),
         "init_seed": trial.init_seed,
         "data_seed": trial.data_seed,
         "num_parameters": model.num_parameters,
         "flops_per_particle": flops_per_particle(model, problem.valid_samples[0].inputs),
     }
+
+
+def _on_its_device(model: Model, training: TrainingConfig) -> Model:
+    return model.to(find_device(training.device, "training.device"))
 
 
 def _begin_or_go_on(model: Model, folder: TrialFolder, config: Mapping) -> Progress:

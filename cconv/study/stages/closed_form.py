@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from cconv.data.splits import evenly_spaced
+from cconv.devices import home_of
 from cconv.errors import ConfigError
 from cconv.models.checkpoint import save_model
 from cconv.networks import ARCHITECTURES
@@ -260,7 +261,7 @@ def _fit_and_record(
         return
     study, problem = session.study, session.problem
     configuration = configure(parameters, study.configuration)
-    model = problem.build_model(configuration, 0)
+    model = problem.build_model(configuration, 0).to(home_of(session.device))
     untrained = configuration.training.model_copy(update={"updates": 0})
     seeds: dict[str, Any] = {"init_seed": init_seed, "data_seed": study.seeds.data}
     trial = Trial(stage=stage, parameters=parameters, provenance=provenance(study), **seeds)

@@ -4,7 +4,7 @@ The select stage evaluates, times and compares them with the functions at the en
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -179,7 +179,11 @@ def retrained_finalists(
 
 
 def evaluate_finalist(
-    finalist: Retrained, objective: Objective, samples: Sequence[Sample], frames_per_block: int
+    finalist: Retrained,
+    objective: Objective,
+    samples: Sequence[Sample],
+    frames_per_block: int,
+    load: Callable[[Path], Model] = load_model,
 ) -> tuple[Errors, np.ndarray]:
     """Measure the errors of a finalist on a split, over its seeds.
 
@@ -188,6 +192,7 @@ def evaluate_finalist(
         objective: The error that finalists are compared by.
         samples: Frames of the split.
         frames_per_block: Frames of a unit if the split has a single trajectory.
+        load: Reads a checkpoint folder, e.g. onto a device.
 
     Returns:
         The mean errors, and the errors of each seed and unit (seeds, units).
@@ -195,7 +200,7 @@ def evaluate_finalist(
     Raises:
         StudyError: If a prediction is not finite.
     """
-    tables = [objective.table(load_model(each), samples, frames_per_block) for each in finalist.checkpoints]
+    tables = [objective.table(load(each), samples, frames_per_block) for each in finalist.checkpoints]
     by_seed = [table.error for table in tables]
     units = np.stack([table.units for table in tables])
     mean = float(np.mean(by_seed))

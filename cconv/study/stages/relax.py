@@ -86,7 +86,7 @@ class RelaxStage(Stage):
         self, session: Session, stage: str, entry: FinalistEntry, samples: Sequence[StepSample], seconds: float
     ) -> RelaxedModel:
         """Try one relaxation after another with a finalist, and record each; what is recorded is not tried again."""
-        model = load_model(session.run.path / entry.checkpoint)
+        model = session.load_model(session.run.path / entry.checkpoint)
         facts = {
             "checkpoint": entry.checkpoint,
             "frames": len(samples[0].window.future),
@@ -137,7 +137,7 @@ def _try(
 
 def _failures(session: Session, checkpoint: str) -> tuple[str, ...]:
     """Run the checks of stability on the relaxed model; a line for each that it fails."""
-    model = load_model(session.run.path / checkpoint)
+    model = session.load_model(session.run.path / checkpoint)
     material, checks = stability_checks(session, model.cutoff)
     seeds = {OFFERED: material.predictor(model)}
     return tuple(measure_stability(seeds, checks, material.counts)["failures"])

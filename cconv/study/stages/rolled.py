@@ -72,7 +72,7 @@ def _of_finalist(
     """Roll out every training of a finalist; the first rollout of its best one is written to `animated`."""
     dataset, rolled, lost = session.dataset, [], []
     for record, checkpoint in zip(finalist.records, finalist.checkpoints, strict=True):
-        model = load_model(checkpoint)
+        model = session.load_model(checkpoint)
         for number in evenly_spaced(len(dataset.splits["test"]), MOST_TRAJECTORIES):
             stored = StoredFrames(dataset, "test", number)
             is_first = number == 0 and checkpoint == finalist.best_checkpoint

@@ -6,11 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from cconv.data.splits import evenly_spaced
+from cconv.data.stored_frames import StoredFrames
 from cconv.evaluation.checks.stability import measure_stability
 from cconv.evaluation.cost import Cost, measure_costs, measure_growth
 from cconv.evaluation.explanation import error_distribution, explain
@@ -202,7 +204,7 @@ def _errors(
     """Measure the errors of each finalist on a split, as facts and as tables (seeds, units)."""
     frames = session.study.finalists.frames_per_block
     both = {
-        each.id: evaluate_finalist(each, session.problem.objective, samples, frames)
+        each.id: evaluate_finalist(each, session.problem.objective, samples, frames, session.load_model)
         for each in session.progress(finalists, label)
     }
     return {name: facts for name, (facts, _) in both.items()}, {name: units for name, (_, units) in both.items()}
@@ -228,7 +230,7 @@ def _time(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str, C
     frames = _timed_frames(session)
     costs, analytic = measure_costs(
         checkpoints,
-        load_model,
+        partial(load_model, device=session.device),  # is sent to other processes
         frames,
         session.dataset.scene,
         task=problem.task,
@@ -243,7 +245,9 @@ def _timed_frames(session: Session) -> list[Any]:
     samples = session.problem.valid_samples
     if isinstance(samples, WindowSamples):
         return list(samples.windows[:TIMED_FRAMES])
-    return list(islice((frame for each in session.dataset.trajectories("valid") for frame in each), TIMED_FRAMES))
+    dataset = session.dataset
+    stored = (StoredFrames(dataset, "valid", k) for k in range(len(dataset.splits["valid"])))
+    return list(islice((each[index] for each in stored for index in range(len(each))), TIMED_FRAMES))
 
 
 def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
@@ -253,7 +257,7 @@ def _growth(session: Session, finalists: Sequence[Retrained]) -> Growth:
     sizes = settings.sizes
     grown = measure_growth(
         checkpoints,
-        load_model,
+        session.load_model,
         analytic=load_model(finalists[0].best_checkpoint).config,
         sizes=sizes,
         threads=settings.threads,
@@ -278,16 +282,18 @@ def _stress(session: Session, finalists: Sequence[Retrained]) -> tuple[dict[str,
     reach = max(load_model(finalist.best_checkpoint).cutoff for finalist in finalists)
     material, checks = stability_checks(session, reach)
     found = {
-        finalist.id: Stability(**measure_stability(_of_seeds(finalist, material.predictor), checks, material.counts))
+        finalist.id: Stability(
+            **measure_stability(_of_seeds(finalist, material.predictor, session.load_model), checks, material.counts)
+        )
         for finalist in session.progress(finalists, "stability")
     }
     return {check.name: check.description() for check in checks}, found
 
 
-def _of_seeds(finalist: Retrained, predictor: Callable[[Model], Any]) -> dict[str, Any]:
+def _of_seeds(finalist: Retrained, predictor: Callable[[Model], Any], load: Callable[[Path], Model]) -> dict[str, Any]:
     """Make what checks test of every training of a finalist, by the name of the training."""
     trained = zip(finalist.records, finalist.checkpoints, strict=True)
-    return {record.id: predictor(load_model(checkpoint)) for record, checkpoint in trained}
+    return {record.id: predictor(load(checkpoint)) for record, checkpoint in trained}
 
 
 def _solver(

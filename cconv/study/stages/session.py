@@ -2,12 +2,17 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from zlib import crc32
 
 import numpy as np
+import torch
 
 from cconv.data.dataset import Dataset
+from cconv.devices import CPU
 from cconv.errors import ConfigError
+from cconv.models.checkpoint import load_model
+from cconv.models.model import Model
 from cconv.study.declared.domains import SearchSpace
 from cconv.study.declared.search_space import load_space
 from cconv.study.declared.stage import reads_of
@@ -38,6 +43,7 @@ class Session:
         count_cost: Counts the cost of a configuration, before anything is built.
         progress: Wraps an iterable to show progress, given a label.
         useless_error: Error of predicting the training mean on the validation split.
+        device: Where models are compared and timed.
     """
 
     study: StudyConfig
@@ -51,6 +57,11 @@ class Session:
     count_cost: CostCounter
     progress: Progress
     useless_error: float
+    device: torch.device = CPU
+
+    def load_model(self, folder: Path) -> Model:
+        """Load a model onto the device of the study."""
+        return load_model(folder, device=self.device)
 
     def read(self, stage: str, *kinds: str) -> list[TrialRecord]:
         """Read the records of the stages that a stage reads, or only of those of the named kinds."""

@@ -4,7 +4,6 @@ import numpy as np
 
 from cconv.errors import CConvError
 from cconv.evaluation.solver_comparison import MeasuredSolver, compared_rollouts, mean_error, measure_solvers
-from cconv.models.checkpoint import load_model
 from cconv.scenes.find import find_scene
 from cconv.study.records.summary import SolverComparison, SolverPoint
 from cconv.study.stages.finalists import Retrained
@@ -41,7 +40,7 @@ def compare_with_solver(
     return SolverComparison(
         points=tuple(map(_point, found)),
         rollouts=len(starts),
-        network_error=mean_error(map(load_model, chosen.checkpoints), starts),
+        network_error=mean_error(map(session.load_model, chosen.checkpoints), starts),
     )
 
 

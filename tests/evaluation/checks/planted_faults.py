@@ -29,6 +29,8 @@ class Analytic:
     def predict(self, frame, scene):
         return self.field(self.state(frame, scene, self.dtype), frame, scene)
 
+    precision = "float32"
+
     def predict_exactly(self, frame, scene):
         return self.field(self.state(frame, scene, torch.float64), frame, scene)
 
@@ -272,7 +274,7 @@ FAULTS = {
     "rate of a translation": Fault(rate_of_a_translation, "still", "uniform_velocity", RATE),
     "rate at rest": Fault(rate_at_rest, "still", "rest", RATE),
     "a bias that drifts": Fault(drifts, "density", "integrated density", RATE),
-    "cancellation in float32": Fault(cancels_in_float32, "precision", "float32"),
+    "cancellation in float32": Fault(cancels_in_float32, "precision", "rounding"),
     "wrong for the fastest one in a hundred": Fault(flips_the_fastest_percent, "regimes", "fastest_percent"),
     "wrong in compressed clumps": Fault(wrong_in_compressed_clumps, "stress", "squeezed"),
     "periodic axes ignored": Fault(ignores_periodic_axes, "regimes", "periodic_face", needs_periodic=True),

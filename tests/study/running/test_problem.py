@@ -38,7 +38,7 @@ def test_a_closed_form_is_fitted_to_stored_windows_however_early_pushforward_beg
     window = window_of(periodic_frame(generator), generator, future=6)
     task = task_named("acceleration")
     samples, config = WindowSamples([window], periodic_scene(), task), SimpleNamespace(features=task.features)
-    unfitted = SimpleNamespace(task=task, predict_frame=None, config=config)
+    unfitted = SimpleNamespace(task=task, predict_frame=None, config=config, home=torch.device("cpu"))
     training = TrainingConfig(pushforward=5, pushforward_from=0.0)
     given = replace(problem(generator), train_samples=samples)
     drawn = [given.examples(training, seed, task).draw([0], 0, unfitted) for seed in range(20)]

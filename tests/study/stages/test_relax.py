@@ -34,6 +34,7 @@ def session(steps_folder, tmp_path):
         problem=SimpleNamespace(task=model.task),
         progress=lambda items, _: items,
         seed_of=lambda name: 7,
+        load_model=load_model,
     )
 
 

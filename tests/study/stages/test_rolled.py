@@ -7,7 +7,7 @@ import pytest
 from systems import untrained_step
 
 from cconv.data.dataset import open_dataset
-from cconv.models.checkpoint import save_model
+from cconv.models.checkpoint import load_model, save_model
 from cconv.models.model import Model
 from cconv.report.rollout_animation import animated
 from cconv.study.records.rollouts import read_rollouts
@@ -27,6 +27,7 @@ def session(steps_folder, tmp_path):
         dataset=dataset,
         problem=SimpleNamespace(task=untrained_step(steps_folder).task),
         progress=lambda items, _: items,
+        load_model=load_model,
     )
 
 

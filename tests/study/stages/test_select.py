@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import torch
 from systems import configured, periodic_scene, periodic_trajectory, problem
 
-from cconv.models.checkpoint import save_model
+from cconv.models.checkpoint import load_model, save_model
 from cconv.study.stages.finalists import Retrained
 from cconv.study.stages.select import _stress
 
@@ -24,6 +24,7 @@ def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
         problem=given,
         dataset=SimpleNamespace(scene=periodic_scene(), trajectories=lambda split: [periodic_trajectory(generator)]),
         progress=lambda items, label: items,
+        load_model=load_model,
     )
     checks, found = _stress(session, [finalist])
     assert list(checks) == list(given.task.checks)
