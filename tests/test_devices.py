@@ -83,12 +83,19 @@ def test_a_missing_device_ends_commands_on_checkpoints_in_one_line(command, ccon
     assert_one_clear_line(cconv(command, tmp_path, "--device", "cuda"), "cuda", "take cpu or auto")
 
 
-def test_a_device_without_memory_is_one_line(cconv, monkeypatch, tmp_path):
+FULL = "CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has "  # as torch says it
+CAPACITY = "a total capacity of 79.00 GiB of which 19.00 GiB is free. Process 1 has 60.00 GiB memory in use."
+
+
+@pytest.mark.parametrize(
+    ("told", "fewer"), [("1 GiB free.", "fewer particles"), (CAPACITY, "at most about 99% of the")]
+)
+def test_a_device_without_memory_is_one_line(told, fewer, cconv, monkeypatch, tmp_path):
     def load(*given, **options):
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has 1 GiB free.")
+        raise torch.OutOfMemoryError(FULL + told)
 
     monkeypatch.setattr("cconv.models.checkpoint.load_model", load)
-    assert_one_clear_line(cconv("evaluate", tmp_path), "CUDA out of memory", "--device cpu")
+    assert_one_clear_line(cconv("evaluate", tmp_path), "CUDA out of memory", fewer, "--device cpu")
 
 
 def train_on(monkeypatch, given, folder, device, network):

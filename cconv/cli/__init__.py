@@ -1,6 +1,7 @@
 """The command line: the only place that parses arguments and prints."""
 
 import os
+import re
 import sys
 from importlib.metadata import version
 from typing import Annotated
@@ -25,6 +26,9 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
+_UNITS = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+_SIZE = rf"([\d.]+) ({'|'.join(_UNITS)})"
+
 for command in (train, fit, evaluate, rollout, export, report, doctor):
     app.command()(command)
 app.command("import")(import_weights)
@@ -69,11 +73,26 @@ def main() -> None:
     except RuntimeError as error:
         if type(error).__name__ != "OutOfMemoryError":  # torch's, which is imported by then
             raise
-        reason = str(error).split(". ")[0]
-        _print_refusal(f"{reason}; take a smaller network or fewer particles at a time, or --device cpu")
+        fits = fitting_share(str(error))
+        fewer = "fewer particles at a time" if fits is None else f"at most about {fits:.0%} of the particles at a time"
+        _print_refusal(f"{str(error).split('. ')[0]}; take a smaller network or {fewer}, or --device cpu")
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def fitting_share(message: str) -> float | None:
+    """Share of the particles that would have fitted on a device, by torch's message that its memory is full.
+
+    Memory grows with the number of particles: what was in use and what was asked for, together, would have to be no
+    more than the device has. None where the message does not say so much.
+    """
+    sizes = re.search(rf"allocate {_SIZE}.*capacity of {_SIZE} of which {_SIZE} is free", message)
+    if sizes is None:
+        return None
+    found = sizes.groups()
+    asked, capacity, free = (float(found[place]) * _UNITS[found[place + 1]] for place in (0, 2, 4))
+    return capacity / (capacity - free + asked)
 
 
 def _print_refusal(reason: str) -> None:

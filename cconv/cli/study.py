@@ -168,13 +168,16 @@ def extend(
     address: Address = None,
     serial: Serial = False,
     storage: Storage = None,
+    device: Device = None,
 ) -> None:
     """Add trials to a search of a study, then rerun the stages that read it; existing trainings are used again."""
-    from cconv.study.pipeline import extend_study
+    from cconv.study.pipeline import change_device, extend_study
     from cconv.study.records.run_folder import RunFolder
 
     _check_place(address, serial)
     folder = RunFolder.open(path)
+    if device is not None:
+        change_device(folder, device)
     extend_study(folder, stage, trials)
     _run_stages(folder, address, storage, serial)
 
