@@ -19,7 +19,7 @@ class Precision(Check[Material, Predictor]):
         "or bfloat16, and in double precision, on unchanged frames and on frames moved by a thousand particle "
         "spacings, divided by the standard deviation of the target."
     )
-    failure = "predictions are {value:.3g} from float64 (limit {limit:g}); {detail}"
+    failure = "{label}: predictions are {value:.3g} from float64 (limit {limit:g}); {detail}"
     limit = 1e-3
     limits: ClassVar = {FLOAT32: limit, TF32: 1e-2, BFLOAT16: 1e-1}  # units of rounding are 6e-8, 5e-4 and 4e-3
 

@@ -109,7 +109,7 @@ def slow_ray(monkeypatch, tmp_path):
 
 def test_a_ray_that_does_not_come_up_in_time_is_started_again_and_leaves_nothing(slow_ray, tmp_path):
     left = slow_ray(STARTS)
-    _start(1, tmp_path)
+    _start(1, 0, tmp_path)
     assert len(left) == STARTS - 1
     assert all(process.wait(PATIENCE) == -signal.SIGKILL for process in left)
 
@@ -117,14 +117,14 @@ def test_a_ray_that_does_not_come_up_in_time_is_started_again_and_leaves_nothing
 def test_a_ray_that_never_comes_up_is_one_line(slow_ray, tmp_path):
     slow_ray(STARTS + 1)
     with pytest.raises(ConfigError, match="Ray does not start on this machine .*timed out") as caught:
-        _start(1, tmp_path)
+        _start(1, 0, tmp_path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "no-such-host.invalid:6379", "nonsense"])
-def test_a_cluster_that_is_not_there_is_one_line(address, cores, tmp_path):
+def test_a_cluster_that_is_not_there_is_one_line(address, cores, flow_folder, tmp_path):
     missing = pytest.raises(ConfigError, match=f"--address {address}.*ray start --head")
-    with missing as caught, ray_pool(None, None, tmp_path, address):
+    with missing as caught, ray_pool(study_of(flow_folder), None, tmp_path, address):
         pass
     assert "\n" not in str(caught.value)
 
