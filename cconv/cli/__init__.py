@@ -18,6 +18,9 @@ from cconv.cli.rollout import rollout
 from cconv.cli.study import app as study_app
 from cconv.errors import CConvError, StudyError, is_disk_full, visible
 
+_UNITS = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+_SIZE = rf"([\d.]+) ({'|'.join(_UNITS)})"
+
 app = typer.Typer(
     name="cconv",
     rich_markup_mode="markdown",  # wraps paragraphs
@@ -26,9 +29,6 @@ app = typer.Typer(
 )
 app.add_typer(data_app, name="data")
 app.add_typer(study_app, name="study")
-_UNITS = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
-_SIZE = rf"([\d.]+) ({'|'.join(_UNITS)})"
-
 for command in (train, fit, evaluate, rollout, export, report, doctor):
     app.command()(command)
 app.command("import")(import_weights)

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from cconv.cli.console import print_json, results
-from cconv.cli.options import AsJson
-from cconv.errors import ConfigError
+from cconv.cli.options import AsJson, check_new
 
 
 def import_weights(
@@ -26,8 +25,7 @@ def import_weights(
     from cconv.models.checkpoint import save_model
     from cconv.models.imported import published_conv_net
 
-    if out.exists():
-        raise ConfigError(f"{out}: exists already; give another --out.")
+    check_new(out)
     model = published_conv_net(weights)
     facts = {
         "stage": "imported",

@@ -12,8 +12,8 @@ import typer
 
 from cconv.cli.console import errors, print_findings, print_json, results, show_progress
 from cconv.cli.live import TrainingBar
-from cconv.cli.options import Force, FrameDt, Mass, Spacing, given_facts
-from cconv.cli.study import DataPath, Device, Log, RunPath, Settings, StudyFile
+from cconv.cli.options import Force, FrameDt, Mass, Spacing, check_new, given_facts
+from cconv.cli.study import DataPath, Device, Log, RunPath, Settings, StudyFile, declared_study
 from cconv.errors import CConvError, ConfigError, DataError
 from cconv.validation import Horizon, check_setting
 
@@ -55,7 +55,8 @@ def train(
     from cconv.study.running.problem import provenance
     from cconv.study.running.trial import Trial, run_trial
 
-    config = _declared_study(study, data, settings, out, device, log)
+    config = declared_study(study, data, settings, log, device)
+    check_new(out)
     problem, dataset = _loaded_problem(config)
     folder = TrialFolder(out)
     seeds = {"init_seed": config.seeds.init, "data_seed": config.seeds.data}
@@ -107,7 +108,8 @@ def fit(
     from cconv.study.running.problem import device_of, provenance
 
     check_setting(Ridge, ridge, "--ridge")
-    config = _declared_study(study, data, settings, out, device)
+    config = declared_study(study, data, settings, device=device)
+    check_new(out)
     check_least_squares(config.training.loss, "a single layer")
     problem, dataset = _loaded_problem(config)
     placed = home_of(device_of(config))  # float64 is needed
@@ -339,31 +341,6 @@ def report(
     results.print(f"Report: {written}", soft_wrap=True)
     if files:
         results.print(f"Tables: {len(files)} files in {tables}", soft_wrap=True)
-
-
-def _declared_study(
-    study: Path,
-    data: str | None,
-    settings: list[str] | None,
-    out: Path,
-    device: str | None,
-    log: list[str] | None = None,
-) -> "StudyConfig":
-    """Return the settings of a study whose single model is written to `out`, which must not exist yet."""
-    from cconv.study.running.problem import device_of, with_data_path, with_device
-    from cconv.study.running.training_logs import with_loggers
-    from cconv.study.studies import load_study
-
-    config = load_study(study, settings or [])
-    config = with_loggers(config, config.log if log is None else log)
-    if data is not None:
-        config = with_data_path(config, data)
-    if device is not None:
-        config = with_device(config, device)
-    device_of(config)
-    if out.exists():
-        raise ConfigError(f"{out}: exists already; give another --out.")
-    return config
 
 
 def _loaded_problem(config: "StudyConfig") -> tuple["Problem", "Dataset"]:

@@ -73,3 +73,9 @@ def open_data(
     from cconv.data.dataset import open_dataset
 
     return open_dataset(path, **given_facts(mass, particle_spacing, frame_dt, force))
+
+
+def check_new(out: Path) -> None:
+    """Raise `ConfigError` if what a command is to write exists already."""
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; give another --out.")

@@ -15,6 +15,7 @@ from cconv.errors import CConvError, ConfigError
 if TYPE_CHECKING:
     import pandas as pd
 
+    from cconv.study.declared.study_file import StudyConfig
     from cconv.study.records.run_folder import RunFolder
     from cconv.study.records.summary import Summary
 
@@ -81,6 +82,28 @@ Log = Annotated[
 ]
 
 
+def declared_study(
+    study: Path,
+    data: str | None = None,
+    settings: list[str] | None = None,
+    log: list[str] | None = None,
+    device: str | None = None,
+) -> "StudyConfig":
+    """The study of a file with what the options of a command replace in it, on a device that this machine has."""
+    from cconv.study.running.problem import device_of, with_data_path, with_device
+    from cconv.study.running.training_logs import with_loggers
+    from cconv.study.studies import load_study
+
+    config = load_study(study, settings or [])
+    config = with_loggers(config, config.log if log is None else log)
+    if data is not None:
+        config = with_data_path(config, data)
+    if device is not None:
+        config = with_device(config, device)
+    device_of(config)
+    return config
+
+
 @app.command()
 def run(
     study: StudyFile,
@@ -109,19 +132,11 @@ def run(
     from cconv.study.declared.search_space import study_space
     from cconv.study.pipeline import begin_study
     from cconv.study.records.run_folder import RunFolder
-    from cconv.study.running.problem import device_of, open_study_data, with_data_path, with_device
-    from cconv.study.running.training_logs import with_loggers
-    from cconv.study.studies import load_study
+    from cconv.study.running.problem import open_study_data
 
     _check_place(address, serial)
-    config = load_study(study, settings or [])
-    config = with_loggers(config, config.log if log is None else log)
+    config = declared_study(study, data, settings, log, device)
     config.check_stages()
-    if data is not None:
-        config = with_data_path(config, data)
-    if device is not None:
-        config = with_device(config, device)
-    device_of(config)
     space = study_space(config)
     open_study_data(config.data, config.seeds.data)
     folder = RunFolder.create(out or Path("runs") / config.name, overwrite)
