@@ -238,14 +238,22 @@ def check_asked(configuration: Configuration, task: str) -> None:
         TASKS[task].check_history(configuration.history)
     except ConfigError as error:
         raise ConfigError(f"not possible ({HISTORY}: {error})") from error
-    if configuration.external_force == BY_INTEGRATOR and not issubclass(TASKS[task], StepTask):
-        raise ConfigError(f"not possible ({EXTERNAL_FORCE}: is for steps, and {task!r} is a field of one frame)")
-    if configuration.relaxation is not None and not issubclass(TASKS[task], StepTask):
-        raise ConfigError(f"not possible ({RELAXATION}: is for steps, and {task!r} is a field of one frame)")
+    if not issubclass(TASKS[task], StepTask):
+        _check_still(configuration, task)
+
+
+def _check_still(configuration: Configuration, field: str) -> None:
+    """Check that a configuration for a field has nothing that only steps have."""
+    of_steps = {
+        EXTERNAL_FORCE: configuration.external_force == BY_INTEGRATOR,
+        RELAXATION: configuration.relaxation is not None,
+    }
+    for name, is_asked in of_steps.items():
+        if is_asked:
+            raise ConfigError(f"not possible ({name}: is for steps, and {field!r} is a field of one frame)")
     for name, value in configuration.training.moving.items():
-        if not issubclass(TASKS[task], StepTask):
-            allowed = f"must be {STILL[name]:g} for the field {task!r}"
-            raise ConfigError(f"not possible ({TRAINING}.{name}: {allowed}, got {value:g})")
+        allowed = f"must be {STILL[name]:g} for the field {field!r}"
+        raise ConfigError(f"not possible ({TRAINING}.{name}: {allowed}, got {value:g})")
 
 
 def check_least_squares(loss: str, of: str) -> None:

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from cconv.errors import did_you_mean, shown
-from cconv.study.declared.paths import by_path, is_table_of_tables
+from cconv.study.declared.paths import is_table_of_tables, paths_of_tables
 from cconv.validation import LARGEST_VALUE, Real, StrictModel, Text, Value, Whole
 
 MOST_VALUES = 100  # of a choice, or of a condition
@@ -32,7 +32,7 @@ class _Parameter(StrictModel):
     @field_validator("when", mode="before")
     @classmethod
     def _conditions_by_path(cls, when: object) -> object:
-        return by_path(when) if isinstance(when, Mapping) else when
+        return paths_of_tables(when)
 
 
 class Choice(_Parameter):
@@ -128,7 +128,7 @@ class SearchSpace(StrictModel):
     @field_validator("parameters", mode="before")
     @classmethod
     def _parameters_by_path(cls, parameters: object) -> object:
-        return by_path(parameters, is_table_of_tables) if isinstance(parameters, Mapping) else parameters
+        return paths_of_tables(parameters, is_table_of_tables)
 
     @model_validator(mode="after")
     def _conditions_can_hold(self) -> "SearchSpace":

@@ -39,6 +39,11 @@ def by_path(
     return values
 
 
+def paths_of_tables(value: object, goes_on: Callable[[object], TypeGuard[Mapping[str, object]]] = is_table) -> object:
+    """Values by their paths, as `by_path`, of what should be tables; anything else as it is, for its form to refuse."""
+    return by_path(value, goes_on) if is_table(value) else value
+
+
 def below(table: str, values: Mapping[str, Each]) -> dict[str, Each]:
     """The values whose paths lead into a table, by the rest of the path."""
     return {path.removeprefix(f"{table}."): each for path, each in values.items() if path.startswith(f"{table}.")}

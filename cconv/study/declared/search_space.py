@@ -52,6 +52,8 @@ def study_space(study: StudyConfig) -> SearchSpace:
             outside its domain.
     """
     space, parameters = load_space(study.search.space, study), {}
+    if not study.search.baseline:
+        return space
     for name, value in study.search.baseline.items():
         setting = f"`search.baseline.{name}`"
         if name not in space.parameters:

@@ -25,7 +25,7 @@ from cconv.study.declared.configuration import (
     check_least_squares,
     configure,
 )
-from cconv.study.declared.paths import by_path
+from cconv.study.declared.paths import paths_of_tables
 from cconv.study.declared.stage import Ridge, Stage, check_names, check_order, included
 from cconv.tasks import TASKS
 from cconv.tasks.task import StepTask
@@ -80,7 +80,7 @@ class SearchConfig(StrictModel):
     @field_validator("baseline", mode="before")
     @classmethod
     def _hyperparameters_by_path(cls, baseline: object) -> object:
-        return by_path(baseline) if isinstance(baseline, Mapping) else baseline
+        return paths_of_tables(baseline)
 
 
 class PredictorConfig(StrictModel):

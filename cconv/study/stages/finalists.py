@@ -19,7 +19,7 @@ from cconv.evaluation.statistics import FEWEST, crossed_interval, why_no_interva
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import TrainingConfig
-from cconv.study.declared.paths import by_path
+from cconv.study.declared.paths import paths_of_tables
 from cconv.study.declared.stage import BASELINE, Stage
 from cconv.study.declared.study_file import StudyConfig
 from cconv.study.evidence.budget import fall_at_the_end
@@ -93,7 +93,7 @@ class FinalistsStage(Stage):
     def _hyperparameters_by_path(cls, include: object) -> object:
         if not isinstance(include, Mapping):
             return include
-        return {name: by_path(each) if isinstance(each, Mapping) else each for name, each in include.items()}
+        return {name: paths_of_tables(each) for name, each in include.items()}
 
     @property
     def included(self) -> Mapping[str, dict[str, Value]]:
