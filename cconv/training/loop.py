@@ -181,12 +181,10 @@ def _update(
     """Take one step on the mean loss of a batch, graph by graph, so that memory does not grow with the batch."""
     optimizer.zero_grad()
     frames, total = sum(len(sample.origins) for sample in batch), 0.0
+    backward: Precision = TF32 if model.config.precision == TF32 else FLOAT32  # autocast is for the way forward
     for sample in batch:
         loss = torch.stack(losses_of(model, sample, geometry, loss_of, steps)).sum() / frames
-        of_backward: Precision = (
-            TF32 if model.config.precision == TF32 else FLOAT32
-        )  # autocast is only for the way forward
-        with products_in(of_backward, model.device):
+        with products_in(backward, model.device):
             loss.backward()
         total += loss.item()
     if math.isfinite(total):
