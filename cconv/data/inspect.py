@@ -1,12 +1,20 @@
 """Plain facts about a data set, and its implausibilities."""
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 
 import torch
 
 from cconv.data.dataset import Dataset
-from cconv.data.plausibility import MOST_NEIGHBORS, SharedFrames, first_of_each, mean_neighbors, trajectory_findings
+from cconv.data.plausibility import (
+    MOST_NEIGHBORS,
+    USUAL_CUTOFF,
+    SharedFrames,
+    first_of_each,
+    mean_neighbors,
+    trajectory_findings,
+)
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box
@@ -25,7 +33,8 @@ def inspect_dataset(
 
     Args:
         dataset: The data set.
-        cutoff: Radius of the neighbour counts; None means twice the particle spacing.
+        cutoff: Radius of the neighbour counts; None means twice the particle spacing, or half of the shortest periodic
+            axis where that is less.
         progress: Wraps the trajectories of a split to show progress, given a label.
 
     Raises:
@@ -33,7 +42,7 @@ def inspect_dataset(
         ConfigError: If the cutoff is not positive, exceeds half of a periodic axis or holds far too many neighbours.
     """
     scene = dataset.scene
-    cutoff = 2 * scene.particle_spacing if cutoff is None else cutoff
+    cutoff = _usual_cutoff(scene) if cutoff is None else cutoff
     collected: dict[ParticleType | str, list] = defaultdict(list)
     splits, findings, shared = {}, [], SharedFrames()
     for split, blocks in dataset.splits.items():
@@ -55,6 +64,11 @@ def inspect_dataset(
         "missing": list(scene.missing),
         "findings": [finding.as_dict() for finding in first_of_each(findings)],
     }
+
+
+def _usual_cutoff(scene: Scene) -> float:
+    wrapping = [length for length, wraps in zip(scene.box.lengths, scene.box.periodic, strict=True) if wraps]
+    return min(USUAL_CUTOFF * scene.particle_spacing, *(length / 2 for length in wrapping), math.inf)
 
 
 def _scene_facts(scene: Scene) -> dict:

@@ -33,6 +33,7 @@ FAR_AWAY = 20  # distance from the middle of the fluid, in distances that nine o
 AT_REST = 1e-4  # length of a step, in particle spacings
 USUAL_CUTOFF = 2  # of networks, in particle spacings
 MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
+PARTICLES_COUNTED = 1000  # for a mean number of neighbours
 MANY_NEIGHBORS = 1000  # within the usual cutoff, beyond which the spacing is wrong
 HALF = 0.5  # share of the fluid particles
 DENSITY_RANGE = (0.7, 1.4)  # number density of the fluid, in that of a lattice of the particle spacing
@@ -235,9 +236,13 @@ class _Fluid:
 
 
 def mean_neighbors(positions: Tensor, radius: float) -> float:
-    """Mean number of particles (N, D) within a radius of one, itself included; without regard to periodic axes."""
-    tree = cKDTree(positions.double().numpy())
-    return float(tree.count_neighbors(tree, radius)) / len(positions)
+    """Mean number of particles (N, D) within a radius of one, itself included; without regard to periodic axes.
+
+    It is that of a thousand particles, evenly spaced in storage, where there are more.
+    """
+    points = positions.double().numpy()
+    asked = points[evenly_spaced(len(points), PARTICLES_COUNTED)]
+    return float(cKDTree(points).query_ball_point(asked, radius, return_length=True).mean())
 
 
 def _first(where: Tensor) -> tuple[int, int, int] | None:

@@ -5,8 +5,10 @@ from torch import Tensor
 
 from cconv.data.trajectory import Frame, Scene
 from cconv.neighbors import radius_graph
+from cconv.sph.compiled import compiled_sums
 from cconv.sph.kernels import QuinticSpline
-from cconv.sph.operators import density
+
+_BLOCK = 200_000  # particles whose pairs are listed at once: about 1 GB in 3D
 
 
 def speed(frame: Frame) -> Tensor:
@@ -32,6 +34,9 @@ def density_deviation(frame: Frame, scene: Scene) -> Tensor:
         ConfigError: If the kernel's support, 3 dx, exceeds half of a periodic axis.
     """
     kernel = QuinticSpline(scene.particle_spacing, scene.dim)
-    masses = frame.masses.double()
-    edges = radius_graph(frame.positions.double(), kernel.support_radius, scene.box)
-    return density(masses, edges, kernel) * scene.particle_spacing**scene.dim / masses - 1
+    positions, masses = frame.positions.double(), frame.masses.double()
+    densities = [
+        compiled_sums(kernel).density(masses, radius_graph(positions, kernel.support_radius, scene.box, block))
+        for block in positions.split(_BLOCK)
+    ]
+    return torch.cat(densities) * scene.particle_spacing**scene.dim / masses - 1

@@ -73,8 +73,9 @@ def split_names(
         frames, needed = num_frames(names[0]), len(fractions) + gap * (len(fractions) - 1)
         if frames < needed:
             raise DataError(
-                f"{folder}: trajectory {names[0]} has {frames} frames, too few to cut into {len(fractions)} blocks "
-                f"with a gap of {gap}; at least {needed} are needed: add frames or lower the gap."
+                f"{folder}: trajectory {names[0]} has {frames} frame{'s' * (frames != 1)}, too few to cut into "
+                f"{len(fractions)} blocks with a gap of {gap}; at least {needed} are needed: add frames or lower the "
+                "gap."
             )
         return split_in_time(names[0], frames, fractions, gap)
     if len(names) < len(fractions):

@@ -37,16 +37,15 @@ class CompiledSums:
         }
 
     def density(self, masses: Tensor, edges: Edges) -> Tensor:
-        """Density by summation (D1) of all particles (N,), themselves included, as `cconv.sph.density`.
+        """Density by summation (D1) of the receivers (N,), particles themselves included, as `cconv.sph.density`.
 
         Raises:
             ShapeError: If `masses` does not fit the edges.
-            ConfigError: If the edges are bipartite, or the kernel reaches further.
+            ConfigError: If the kernel reaches further than the edges.
         """
-        check_one_set(edges)
         check_sum(edges, self.kernel, masses=(masses, (edges.num_senders,)))
-        own = not edges.includes_self
-        return self._sum(_densities, edges, masses, edges.num_senders, self._values(masses), own)
+        own = not (edges.bipartite or edges.includes_self)
+        return self._sum(_densities, edges, masses, edges.num_receivers, self._values(masses), own)
 
     def density_rate(self, masses: Tensor, velocities: Tensor, edges: Edges) -> Tensor:
         """Material rate of density (D2) (N,), as `cconv.sph.density_rate`.

@@ -54,6 +54,12 @@ def test_every_trajectory_is_looked_at(tmp_path):
         inspect_dataset(open_dataset(tmp_path), cutoff=0.26)
 
 
+def test_usual_cutoff_fits_a_small_periodic_box(tmp_path):
+    write_lattice(tmp_path)
+    facts = inspect_dataset(open_dataset(tmp_path, particle_spacing=0.3))
+    assert facts["neighbors"]["cutoff"] == 0.5
+
+
 def test_cutoff_beyond_half_the_box_is_refused(tmp_path):
     write_lattice(tmp_path)
     with pytest.raises(ConfigError, match="cutoff"):

@@ -5,6 +5,9 @@ from systems import periodic_frame, periodic_scene
 
 from cconv.data.quantities import density_deviation, speed
 from cconv.domain import Box
+from cconv.neighbors import radius_graph
+from cconv.sph.kernels import QuinticSpline
+from cconv.sph.operators import density
 
 
 def lattice(generator, particles_per_side=8):
@@ -29,6 +32,16 @@ def test_density_is_below_rest_at_a_free_surface_only(generator):
     inside = ((frame.positions > 3 / 16) & (frame.positions < 13 / 16)).all(dim=1)
     assert deviation[inside].abs().max() < 1e-4
     assert deviation[frame.positions[:, 1] > 15 / 16].max() < -0.2
+
+
+def test_deviation_is_that_of_the_exact_sum_in_any_blocks(generator, monkeypatch):
+    frame, scene = periodic_frame(generator), periodic_scene()
+    kernel = QuinticSpline(scene.particle_spacing, 2)
+    masses = frame.masses.double()
+    exact = density(masses, radius_graph(frame.positions.double(), kernel.support_radius, scene.box), kernel)
+    monkeypatch.setattr("cconv.data.quantities._BLOCK", 10)
+    expected = exact * scene.particle_spacing**2 / masses - 1
+    torch.testing.assert_close(density_deviation(frame, scene), expected, rtol=0, atol=3e-6)
 
 
 def test_wall_particles_count(generator):

@@ -69,6 +69,14 @@ def test_a_particle_that_is_listed_as_its_own_neighbour_counts_once(generator):
     close(CompiledSums(kernel).density(masses, edges), density(masses, edges, kernel), torch.float64)
 
 
+def test_densities_at_some_particles_alone_are_those_of_all(generator):
+    positions, _, masses, box = fluid(2, torch.float64, generator)
+    sums = CompiledSums(CubicSpline(0.15, 2))
+    everywhere = sums.density(masses, radius_graph(positions, 0.3, box))
+    there = sums.density(masses, radius_graph(positions, 0.3, box, queries=positions[20:30]))
+    torch.testing.assert_close(there, everywhere[20:30])
+
+
 def test_threads_share_the_rows_and_change_nothing(generator):
     positions = torch.rand(4000, 3, generator=generator)
     velocities, masses = torch.randn(4000, 3, generator=generator), torch.ones(4000)
