@@ -7,7 +7,7 @@ than the training data. A task names the checks that its models must pass.
 from collections.abc import Sequence
 from typing import Any
 
-from cconv.data.trajectory import Scene, Trajectory
+from cconv.data.trajectory import Frames, Scene
 from cconv.evaluation.checks.check import Check
 from cconv.evaluation.checks.completion import Completion
 from cconv.evaluation.checks.density import IntegratedDensity
@@ -30,7 +30,7 @@ CHECKS: dict[str, type[Check[Any, Any]]] = {check.name: check for check in (*_OF
 
 
 def material_for(
-    task: Task, trajectories: Sequence[Trajectory], scene: Scene, reach: float
+    task: Task, trajectories: Sequence[Frames], scene: Scene, reach: float
 ) -> Material | RolloutMaterial:
     """Prepare what the models of a task are checked on: frames of a field, or the starts of rollouts.
 

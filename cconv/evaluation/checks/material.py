@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cconv.data.splits import evenly_spaced
-from cconv.data.trajectory import Frame, Scene, Trajectory
+from cconv.data.trajectory import Frame, Frames, Scene
 from cconv.errors import DataError
 from cconv.evaluation.checks.predictor import ModelPredictor, Predictor
 from cconv.evaluation.checks.states import AS_IT_IS, State, stressed_states
@@ -65,7 +65,7 @@ class Material:
 
     task: FieldTask
     scene: Scene
-    trajectory: Trajectory
+    trajectory: Frames
     plain: tuple[Probe, ...]
     few: tuple[tuple[Frame, str], ...]
     typical: float
@@ -103,7 +103,7 @@ class Material:
 
 
 def make_material(
-    trajectories: Sequence[Trajectory], scene: Scene, task: FieldTask, reach: float | None = None
+    trajectories: Sequence[Frames], scene: Scene, task: FieldTask, reach: float | None = None
 ) -> Material:
     """Prepare the frames for the checks of a task in a scene.
 
@@ -116,10 +116,10 @@ def make_material(
     Raises:
         DataError: If there is no frame.
     """
-    frames = [(each[index], _origin(each, index)) for each in trajectories for index in range(len(each))]
-    if not frames:
+    stored = [(each, index) for each in trajectories for index in range(len(each))]
+    if not stored:
         raise DataError("There is no validation frame to test stability on; give the split at least one.")
-    chosen = [frames[place] for place in evenly_spaced(len(frames), PLAIN_FRAMES)]
+    chosen, few = (_read(stored, count) for count in (PLAIN_FRAMES, STRESSED_FRAMES))
     states = [task.state(frame, scene) for frame, _ in chosen]
     targets = [task.field(state) for state in states]
     typical = max(float(torch.cat(targets).var(dim=0, correction=0).mean()), _rounding(states, task))
@@ -132,7 +132,7 @@ def make_material(
         scene=scene,
         trajectory=trajectories[0],
         plain=tuple(plain),
-        few=tuple(frames[place] for place in evenly_spaced(len(frames), STRESSED_FRAMES)),
+        few=few,
         typical=typical,
         fastest=max(float(state.velocities.norm(dim=1).max()) for state in states),
         reach=max(reach or 0.0, states[0].kernel.support_radius),
@@ -151,7 +151,13 @@ def relative_error(predictor: Predictor, probe: Probe) -> float:
     return float(squared_errors(predictor, probe)[probe.affected].mean() / probe.scale)
 
 
-def _origin(trajectory: Trajectory, index: int) -> str:
+def _read(stored: Sequence[tuple[Frames, int]], count: int) -> tuple[tuple[Frame, str], ...]:
+    """So many of the stored frames, evenly spaced, each with where it is from."""
+    chosen = [stored[place] for place in evenly_spaced(len(stored), count)]
+    return tuple((trajectory[index], _origin(trajectory, index)) for trajectory, index in chosen)
+
+
+def _origin(trajectory: Frames, index: int) -> str:
     return f"trajectory {trajectory.name}, frame {trajectory.first_frame + index}"
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from cconv.data.splits import evenly_spaced
-from cconv.data.trajectory import Scene, Trajectory
+from cconv.data.trajectory import Frames, Scene
 from cconv.data.window import Window, window_at
 from cconv.evaluation.checks.check import Check, Finding
 from cconv.evaluation.checks.starts import Start, other_starts
@@ -92,7 +92,7 @@ class RolloutMaterial:
         return rolled[key]
 
 
-def make_rollout_material(trajectories: Sequence[Trajectory], scene: Scene, task: StepTask) -> RolloutMaterial:
+def make_rollout_material(trajectories: Sequence[Frames], scene: Scene, task: StepTask) -> RolloutMaterial:
     """Choose the starts of rollouts: the first windows of some trajectories, and others in the first of these."""
     chosen = [trajectories[place] for place in evenly_spaced(len(trajectories), MOST_STARTS)]
     present = task.history - 1

@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from cconv.data.trajectory import Boundary, Scene, Trajectory
+from cconv.data.trajectory import Boundary, Frames, Scene
 from cconv.data.window import Window, window_at
 from cconv.domain import Box
 from cconv.forces import Accelerating, Force
@@ -99,7 +99,7 @@ class Start:
     mapping: Mapping
 
 
-def other_starts(trajectory: Trajectory, scene: Scene, history: int, frames: int) -> tuple[Start, ...]:
+def other_starts(trajectory: Frames, scene: Scene, history: int, frames: int) -> tuple[Start, ...]:
     """Make the starts of rollouts in which models fail, from the first and the last window of a trajectory.
 
     Args:

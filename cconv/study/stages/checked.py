@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from cconv.data.stored_frames import kept_trajectories
 from cconv.evaluation.checks import make_checks, material_for
 from cconv.evaluation.checks.check import Check
 from cconv.study.stages.session import Session
@@ -14,6 +15,6 @@ def stability_checks(session: Session, reach: float) -> tuple[Any, list[Check[An
         session: The study.
         reach: Largest distance that a model searches.
     """
-    trajectories = list(session.dataset.trajectories("valid"))
+    trajectories = kept_trajectories(session.dataset, "valid")
     material = material_for(session.problem.task, trajectories, session.dataset.scene, reach)
     return material, make_checks(material)

@@ -31,6 +31,25 @@ def test_the_number_of_frames_is_bounded():
     assert len({probe.origin for probe in material.stressed}) == STRESSED_FRAMES
 
 
+def test_only_frames_that_are_looked_at_are_read():
+    trajectory, scene = flow(2, walls=False, periodic=True, frames=3)
+    read = set()
+
+    class Stored:
+        name, first_frame, particle_types, boundary = "stored", 0, trajectory.particle_types, trajectory.boundary
+
+        def __len__(self):
+            return 1000
+
+        def __getitem__(self, index):
+            read.add(index)
+            return trajectory[index % 3]
+
+    material = make_material([Stored()], scene, task_named("density_rate"))
+    assert len(material.plain) == PLAIN_FRAMES
+    assert len(read) <= PLAIN_FRAMES + STRESSED_FRAMES
+
+
 def test_frames_from_start_to_end_are_stressed():
     material = flow_material("density_rate", dim=2, walls=False, periodic=True)
     origins = list(dict.fromkeys(probe.origin for probe in material.stressed))
