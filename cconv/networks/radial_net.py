@@ -303,19 +303,20 @@ class RadialNetSettings(ConvolutionSettings):
         if reads <= MOST_READS:
             # Two values and a message of each read; projections, directions.
             of_pair, of_particle = 3 * reads + dim * vectors + dim * to_vectors, 0
-            moved = reads * FLOAT
+            moved, kept = reads * FLOAT, 0
         else:
             of_scalars = (scalars + vectors) * (to_scalars > 0)
             of_vectors = dim * (scalars + 2 * vectors) * (to_vectors > 0)
             columns = of_scalars + of_vectors
-            # Projections; messages at the two terms around a pair; then columns times filters.
+            # Projections; messages at the two terms around a pair, in columns that stay in a core's cache, from which
+            # the product with the filters reads them once.
             of_pair = dim * vectors + 2 * columns
             of_particle = self.radial_terms * (of_scalars * to_scalars + of_vectors * to_vectors)
-            moved = 2 * columns * ARRAY
+            moved, kept = 0, self.radial_terms * columns * FLOAT
         moved += 2 * INDEX + (dim + 1 + conv.inputs.num_values(dim)) * FLOAT
         return CountedCost(
             flops_per_particle=2.0 * (neighbors * of_pair + of_particle),
-            bytes_per_particle=neighbors * moved + conv.outputs.num_values(dim) * ARRAY,
+            bytes_per_particle=neighbors * moved + kept + conv.outputs.num_values(dim) * ARRAY,
         )
 
     def _geometry_arrays(self, dim: int) -> int:

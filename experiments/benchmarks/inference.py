@@ -79,6 +79,21 @@ CHECKED = COMPARED | {
         "task.features.walls": False,
     },
     "3 radial layers of 8": LAYERS | {"network.layers": 3, "network.first_channels": 8, "network.hidden_channels": 8},
+    "2 radial layers of 64": LAYERS | {"network.layers": 2, "network.first_channels": 64},
+    "3 radial layers of 32": LAYERS
+    | {"network.layers": 3, "network.first_channels": 32, "network.hidden_channels": 32},
+    "3 radial layers of 64": LAYERS
+    | {"network.layers": 3, "network.first_channels": 64, "network.hidden_channels": 64},
+    "3 radial layers of 64, 8 terms, no walls": LAYERS
+    | {
+        "network.layers": 3,
+        "network.first_channels": 64,
+        "network.hidden_channels": 64,
+        "network.radial_terms": 8,
+        "task.features.walls": False,
+    },
+    "4 radial layers of 32, 8 terms": LAYERS
+    | {"network.first_channels": 32, "network.hidden_channels": 32, "network.radial_terms": 8},
 }
 SEARCHES = [(dim, count, periodic) for dim in (1, 2, 3) for count in (500, 5000, 50_000) for periodic in (False, True)]
 SEARCHES += [(3, 100_000, False), (3, 100_000, True)]
@@ -121,8 +136,8 @@ def sample_of(scene: Scene, frame: Frame) -> Sample:
 
 
 def model_of(settings: Mapping, scene: Scene, sample: Sample) -> Model:
-    features, network, _ = configure(settings, DEFAULTS)
-    return build_model(network, task_named("density_rate"), features, scene, [sample]).eval()
+    chosen = configure(settings, DEFAULTS)
+    return build_model(chosen.network, task_named("density_rate"), chosen.features, scene, [sample]).eval()
 
 
 def cloud(dim: int, count: int, periodic: bool) -> tuple[torch.Tensor, Box]:
@@ -257,9 +272,9 @@ def measure_checks(data: Path, plan: Plan) -> dict:
         )
     counted = {}
     for name, settings in plan.checked.items():
-        features, network, _ = configure(settings, DEFAULTS)
-        walls = Kinds(0, 1) if WALLS in features else None
-        counted[name] = network.count(kinds_of(features), walls, Kinds(1, 0), DIM, around)
+        chosen = configure(settings, DEFAULTS)
+        walls = Kinds(0, 1) if WALLS in chosen.features else None
+        counted[name] = chosen.network.count(kinds_of(chosen.features), walls, Kinds(1, 0), DIM, around)
     check = check_cost_model(counted, {name: cost.us_per_particle for name, cost in costs.items()})
     return {
         "growth": {name: asdict(each) for name, each in growth.items()},
