@@ -24,6 +24,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from cconv import open_dataset, radius_graph
 from cconv.data.trajectory import Frame, Scene
@@ -363,6 +364,10 @@ def draw_check(panel: plt.Axes, check: dict) -> None:
     panel.set(
         xscale="log", yscale="log", xlabel="measured, µs a particle", ylabel="predicted from the others", title=title
     )
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(ScalarFormatter())
+        axis.set_minor_formatter(NullFormatter())
 
 
 def main() -> None:
