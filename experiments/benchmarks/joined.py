@@ -5,8 +5,9 @@
 The network is that of `experiments/rollout_taylor_green.toml`, its weights drawn at random, which does not change
 times. A training step draws a batch (with noise, so that nothing is cached), and takes losses and derivatives; a
 validation rolls all windows out for a few frames. Both ways take turns, so that other processes disturb them alike;
-ratios are of CPU time, medians with quartiles. Folders are in the LagrangeBench layout; those of periodic flows without
-walls, e.g. `cconv data generate taylor_green_2d --size small --out FOLDER`. Writes `joined.json`.
+ratios are of CPU time, medians with quartiles; wall times mean something on an idle machine only. Folders are in the
+LagrangeBench layout; those of periodic flows without walls, e.g. `cconv data generate taylor_green_2d --size small
+--out FOLDER`. Writes `joined.json`.
 """
 
 import argparse
@@ -68,20 +69,22 @@ def validation(samples: WindowSamples, model: Model) -> None:
 
 
 def compared(work: Callable[[WindowSamples, Model], None], samples: WindowSamples, model: Model, rounds: int) -> dict:
-    """CPU time of both ways, ms, and their ratio; the first round is a warm-up."""
+    """CPU time and wall time of both ways, ms, and the ratio of CPU times; the first round is a warm-up."""
     times: dict[str, list[float]] = {way: [] for way in WAYS}
+    walls: dict[str, list[float]] = {f"{way}, wall": [] for way in WAYS}
     for turn in range(rounds + 1):
         for way in WAYS if turn % 2 else WAYS[::-1]:
             # Groups of at most no particles are single windows, those of at most all particles hold every window.
             most = 10**9 if way == "joined" else 0
             with patch("cconv.data.window.groups_of", lambda counts, kinds, most=most: groups_of(counts, kinds, most)):
-                before = time.process_time()
+                before, clock = time.process_time(), time.perf_counter()
                 work(samples, model)
-                spent = 1e3 * (time.process_time() - before)
+                spent, passed = 1e3 * (time.process_time() - before), 1e3 * (time.perf_counter() - clock)
             if turn:
                 times[way].append(spent)
+                walls[f"{way}, wall"].append(passed)
     ratios = np.array(times["one by one"]) / np.array(times["joined"])
-    rows: dict[str, Any] = {way: quartiles(found) for way, found in times.items()}
+    rows: dict[str, Any] = {way: quartiles(found) for way, found in (times | walls).items()}
     return rows | {"one by one / joined": quartiles(ratios)}
 
 
