@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 
 from cconv.models.model import Model, ModelConfig
+from cconv.models.published_weights import read_published
 from cconv.models.standardization import Standardization
 from cconv.networks import ConvNetSettings
-from cconv.networks.published import read_published
 from cconv.tasks.features import CONSTANT, VELOCITY, WALLS
 
 SPACING, FRAME_DT = 0.05, 0.02  # of the published data, m and s

@@ -151,8 +151,12 @@ CHANGES = {
     "another shape": (replaced(NAME, np.zeros((64, 63), np.float32)), "(64, 64)"),
     "another type": (replaced(NAME, np.zeros((64, 64))), "float32"),
     "text": (replaced(NAME, "pickle"), "float32"),
-    "a link to another file": (replaced(NAME, h5py.ExternalLink("/etc/passwd", "x")), "is missing"),
-    "a link to another tensor": (replaced(NAME, h5py.SoftLink(member("dense1", "kernel"))), "is missing"),
+    "a link to another file": (replaced(NAME, h5py.ExternalLink("/etc/passwd", "x")), "link to another file"),
+    "a link to a tensor of another shape": (
+        replaced(NAME, h5py.SoftLink("/" + member("dense1", "kernel"))),
+        "(64, 64)",
+    ),
+    "a link that leads nowhere": (replaced(NAME, h5py.SoftLink("/nowhere")), "leads nowhere"),
     "NaN": (replaced(NAME, np.full((64, 64), np.nan, np.float32)), "NaN"),
 }
 

@@ -29,9 +29,7 @@ _OF_STEPS = (Completion, Motion, Packing, PerturbedStarts, MappedStarts, LaterSt
 CHECKS: dict[str, type[Check[Any, Any]]] = {check.name: check for check in (*_OF_FIELDS, *_OF_STEPS)}
 
 
-def material_for(
-    task: Task, trajectories: Sequence[Frames], scene: Scene, reach: float
-) -> Material | RolloutMaterial:
+def material_for(task: Task, trajectories: Sequence[Frames], scene: Scene, reach: float) -> Material | RolloutMaterial:
     """Prepare what the models of a task are checked on: frames of a field, or the starts of rollouts.
 
     Args:

@@ -5,7 +5,6 @@ Source: Ummenhofer et al., "Lagrangian Fluid Simulation with Continuous Convolut
 `MyParticleNetwork/<layer>/kernel:0` and `bias:0`.
 """
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +12,8 @@ import h5py
 import torch
 from torch import Tensor
 
+from cconv.data.hdf5_members import check_stored, linked
+from cconv.data.limits import one_line
 from cconv.errors import DataError
 
 _MODEL = "MyParticleNetwork"  # of their code
@@ -25,7 +26,7 @@ _DENSE = {f"dense{number}{'_fluid' if number == 0 else ''}": f"dense.{number}" f
 def read_published(path: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Read the weights of the published ConvNet.
 
-    Links are not followed, and no member is read whose shape or type is not the expected one.
+    Links out of the file are not followed, and no member is read whose shape or type is not the expected one.
 
     Args:
         path: The HDF5 file.
@@ -66,35 +67,25 @@ def read_published(path: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor
 def _read(file: h5py.File, layer: str, member: str, shape: tuple[int, ...]) -> Tensor:
     """Read a member of a layer after a check of what it is."""
     name = f"{layer}/{_MODEL}/{layer}/{member}"
-    place, found = f"{Path(file.filename)}: `{name}`", _member(file, name)
+    path = Path(file.filename)
+    place, found = f"{path}: `{name}`", _member(file, name, f"{path}, {layer}")
     if not isinstance(found, h5py.Dataset):
         raise DataError(f"{place} is missing; these are not the weights of the published ConvNet.")
     if found.shape != tuple(shape) or found.dtype != "float32":
         raise DataError(
-            f"{place} must have shape {tuple(shape)} and type float32, got {found.shape} and {str(found.dtype)[:100]}; "
-            "only the published ConvNet can be imported."
+            f"{place} must have shape {tuple(shape)} and type float32, got {found.shape} and "
+            f"{one_line(found.dtype, 100)}; only the published ConvNet can be imported."
         )
-    if found.external or found.is_virtual or not _is_written(found):
-        raise DataError(f"{place} is kept outside the file or was never written; download the file again.")
+    check_stored(found, path.parent, place)
     values = torch.from_numpy(found[()])
     if not torch.isfinite(values).all():
         raise DataError(f"{place} holds NaN or infinity; download the file again.")
     return values
 
 
-def _member(file: h5py.File, name: str) -> object:
-    """The member at a path, None if there is none or a link leads to it."""
-    found: object = file
+def _member(file: h5py.File, name: str, place: str) -> h5py.Group | h5py.Dataset | None:
+    """The member at a path, None if there is none."""
+    found: h5py.Group | h5py.Dataset | None = file
     for part in name.split("/"):
-        if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
-            return None
-        found = found[part]
+        found = linked(found, part, place) if isinstance(found, h5py.Group) else None
     return found
-
-
-def _is_written(dataset: h5py.Dataset) -> bool:
-    """Whether all values are in the file."""
-    if dataset.chunks is None:
-        return dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
-    chunks = math.prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-    return dataset.id.get_num_chunks() >= chunks
