@@ -7,14 +7,9 @@ from collections.abc import Callable, Iterable
 import torch
 
 from cconv.data.dataset import Dataset
-from cconv.data.plausibility import (
-    MOST_NEIGHBORS,
-    USUAL_CUTOFF,
-    SharedFrames,
-    first_of_each,
-    mean_neighbors,
-    trajectory_findings,
-)
+from cconv.data.fluid_checks import USUAL_CUTOFF
+from cconv.data.plausibility import SharedFrames, first_of_each, trajectory_findings
+from cconv.data.quantities import MOST_NEIGHBORS, mean_neighbors
 from cconv.data.stored_frames import StoredFrames
 from cconv.data.trajectory import Frame, ParticleType, Scene, Trajectory
 from cconv.domain import Box

@@ -1,13 +1,17 @@
-"""Quantities of the particles of a frame, for colours and export."""
+"""Quantities of the particles of a frame, for colours, export and checks."""
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from cconv.data.splits import evenly_spaced
 from cconv.data.trajectory import Frame, Scene
 from cconv.neighbors import radius_graph
 from cconv.sph.compiled import compiled_sums
 from cconv.sph.kernels import QuinticSpline
 
+MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
+PARTICLES_COUNTED = 1000  # for a mean number of neighbours
 _BLOCK = 200_000  # particles whose pairs are listed at once: about 1 GB in 3D
 
 
@@ -40,3 +44,13 @@ def density_deviation(frame: Frame, scene: Scene) -> Tensor:
         for block in positions.split(_BLOCK)
     ]
     return torch.cat(densities) * scene.particle_spacing**scene.dim / masses - 1
+
+
+def mean_neighbors(positions: Tensor, radius: float) -> float:
+    """Mean number of particles (N, D) within a radius of one, itself included; without regard to periodic axes.
+
+    It is that of a thousand particles, evenly spaced in storage, where there are more.
+    """
+    points = positions.double().numpy()
+    asked = points[evenly_spaced(len(points), PARTICLES_COUNTED)]
+    return float(cKDTree(points).query_ball_point(asked, radius, return_length=True).mean())

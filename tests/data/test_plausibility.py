@@ -10,7 +10,8 @@ import torch
 from particle_files import write_hdf5
 
 from cconv.data.dataset import open_dataset
-from cconv.data.plausibility import CHECKS, dataset_findings, refuse_nonsense, trajectory_findings
+from cconv.data.fluid_checks import CHECKS
+from cconv.data.plausibility import dataset_findings, refuse_nonsense, trajectory_findings
 from cconv.data.trajectory import ParticleType, Scene, Trajectory
 from cconv.domain import Box
 from cconv.errors import DataError
