@@ -57,6 +57,11 @@ def check_wish(wish: str, name: str = "--device") -> None:
         raise ConfigError(f"`{name}` must be {WISHES}, got {shown(wish)}.")
 
 
+def finest_dtype(device: torch.device) -> torch.dtype:
+    """float64, or float32 on Apple's GPUs, which do not know it."""
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
 def _why_no_cuda() -> str:
     return "" if torch.version.cuda else f" (this torch, {torch.__version__}, is built without CUDA)"
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from cconv import tensor_cell_list
 from cconv.batching import check_batch_index, counts_of, index_of, joined_indices, joined_splits
 from cconv.cell_list import CellGrid, Cells, half_pairs, pairs_by_receiver, separations
+from cconv.devices import finest_dtype
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, check_shape
 
@@ -224,7 +225,7 @@ def _pairs_on_device(
     positions: Tensor, queries: Tensor | None, cutoff: float, box: Box | None, include_self: bool, windows: Windows
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Splits, receivers and senders of the pairs, by torch operations on the device of the points."""
-    dtype = torch.float32 if positions.device.type == "mps" else torch.float64  # which Apple's GPUs do not know
+    dtype = finest_dtype(positions.device)
     senders = from_corner(positions.to(dtype), box)
     receivers = senders if queries is None else from_corner(queries.to(dtype), box)
     lengths, skips_self = _periodic_lengths(positions.shape[1], box).tolist(), queries is None and not include_self

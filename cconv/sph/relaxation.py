@@ -17,7 +17,7 @@ as in the authors' code wherever their data have walls. Differences from that co
 wrap, where it wraps all of them; the constant of the kernel in three dimensions is 1/(120π), where it has 3/(359π),
 0.28 % more.
 
-Sums over pairs are those of the solver, compiled for the CPU.
+Sums over pairs are those of the solver, compiled for the CPU; other devices take torch operations.
 """
 
 import math
@@ -28,9 +28,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cconv.devices import finest_dtype
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, SimulationError, check_shape
-from cconv.sph import pair_loops
+from cconv.sph import pair_loops, tensor_relaxation
 from cconv.sph.kernel_table import kernel_tables
 from cconv.sph.kernels import QuinticSpline
 from cconv.sph.neighbor_list import NeighborList, moved, padded, periodic_lengths, unpadded
@@ -56,7 +57,8 @@ def relax(
     """Positions after `loops` shifts of the fluid by pressure and viscosity, see the module for the equations.
 
     At rest every particle fills dx^D, whatever its mass, so no density has to be known. Particles at exactly the same
-    place do not push each other apart. The shifts are computed on the CPU in float64; derivatives do not pass.
+    place do not push each other apart. The shifts are computed in float64, where the device of the positions has it;
+    derivatives do not pass.
 
     Args:
         positions: x (N, D), length.
@@ -78,16 +80,10 @@ def relax(
     """
     check_relaxation(alpha, beta, loops)
     _check_particles(positions, before, is_wall, box, particle_spacing)
-    forces = _Forces(box, particle_spacing, is_wall.cpu().numpy())
-    shifted = positions.detach().cpu().double()
-    displacements = padded(box.displacement(shifted, before.detach().cpu().double()))
-    places = padded(shifted)
-    for _ in range(loops):
-        shifts = alpha * forces.shifts(places, displacements, beta)
-        _check_shifts(shifts, particle_spacing, alpha)
-        places, displacements = moved(places, shifts, 1.0, box), displacements + shifts
-    relaxed = box.wrap(unpadded(places, box.dim).to(positions))
-    return torch.where(is_wall[:, None], positions, relaxed)
+    relaxed = (_relaxed if positions.device.type == "cpu" else _relaxed_on_device)(
+        positions.detach(), before.detach(), is_wall, box, particle_spacing, alpha, beta, loops
+    )
+    return torch.where(is_wall[:, None], positions, box.wrap(relaxed.to(positions)))
 
 
 def check_relaxation(alpha: float, beta: float, loops: int) -> None:
@@ -97,6 +93,56 @@ def check_relaxation(alpha: float, beta: float, loops: int) -> None:
             raise ConfigError(f"`{name}` of a relaxation must be a number from 0 on, got {value}.")
     if loops < 1:
         raise ConfigError(f"`loops` of a relaxation must be at least 1, got {loops}.")
+
+
+def _relaxed(
+    positions: Tensor,
+    before: Tensor,
+    is_wall: Tensor,
+    box: Box,
+    particle_spacing: float,
+    alpha: float,
+    beta: float,
+    loops: int,
+) -> Tensor:
+    """Positions after the shifts, by compiled loops."""
+    forces = _Forces(box, particle_spacing, is_wall.numpy())
+    shifted = positions.double()
+    places, displacements = padded(shifted), padded(box.displacement(shifted, before.double()))
+    for _ in range(loops):
+        shifts = alpha * forces.shifts(places, displacements, beta)
+        _check_shifts(shifts, particle_spacing, alpha)
+        places, displacements = moved(places, shifts, 1.0, box), displacements + shifts
+    return unpadded(places, box.dim)
+
+
+def _relaxed_on_device(
+    positions: Tensor,
+    before: Tensor,
+    is_wall: Tensor,
+    box: Box,
+    particle_spacing: float,
+    alpha: float,
+    beta: float,
+    loops: int,
+) -> Tensor:
+    """Positions after the shifts, by torch operations on the device of the positions."""
+    places = positions.to(finest_dtype(positions.device))
+    displacements = box.displacement(places, before.to(places))
+    for _ in range(loops):
+        shifts = alpha * tensor_relaxation.shifts(
+            places,
+            displacements,
+            is_wall,
+            box=box,
+            particle_spacing=particle_spacing,
+            beta=beta,
+            densities_within=(LEAST_DENSITY, MOST_DENSITY),
+            stiffness=_FLUID.reference_pressure,
+        )
+        _check_shifts(shifts, particle_spacing, alpha)
+        places, displacements = box.wrap(places + shifts), displacements + shifts
+    return places
 
 
 class _Forces:
@@ -164,8 +210,8 @@ def _check_particles(positions: Tensor, before: Tensor, is_wall: Tensor, box: Bo
         raise ConfigError(f"`particle_spacing` must be positive, got {particle_spacing}.")
 
 
-def _check_shifts(shifts: np.ndarray, particle_spacing: float, alpha: float) -> None:
-    farthest = math.sqrt((shifts**2).sum(axis=1).max()) / particle_spacing
+def _check_shifts(shifts: np.ndarray | Tensor, particle_spacing: float, alpha: float) -> None:
+    farthest = math.sqrt(float((shifts**2).sum(1).max())) / particle_spacing
     if not farthest <= FARTHEST_SHIFT:
         raise SimulationError(
             f"A relaxation with alpha {alpha:g} shifted a particle by {farthest:.3g} particle spacings in one loop, "

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from oracles.dense_relaxation import dense_relax
+from simulated_device import simulated_device
 
 from cconv import Box, radius_graph
 from cconv.errors import ConfigError, ShapeError, SimulationError
@@ -42,10 +43,19 @@ def spread(positions, scene):
     return edges.distances.min() / spacing, density(masses, edges, QuinticSpline(spacing, box.dim)).std()
 
 
+def relax_on_device(positions, before, is_wall, **settings):
+    """The same on a device that has no compiled loops."""
+    with simulated_device() as device:
+        relaxed = relax(positions.to(device), before.to(device), is_wall.to(device), **settings)
+        assert relaxed.device == device
+        return relaxed.cpu()
+
+
+@pytest.mark.parametrize("relaxed", [relax, relax_on_device])
 @pytest.mark.parametrize("walls", [0, 9])
 @pytest.mark.parametrize("periodic", [True, False])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_it_is_the_sum_over_all_pairs(dim, periodic, walls, generator):
+def test_it_is_the_sum_over_all_pairs(dim, periodic, walls, relaxed, generator):
     """Some walls move, as lids do, and one is far from the fluid."""
     positions, before, is_wall, scene = cloud(dim, generator)
     is_wall[:walls] = True
@@ -53,7 +63,7 @@ def test_it_is_the_sum_over_all_pairs(dim, periodic, walls, generator):
         scene["box"] = opened(scene["box"])
         positions[0] = 10.0
         before[0] = 10.1
-    found = relax(positions, before, is_wall, **scene, **SETTINGS)
+    found = relaxed(positions, before, is_wall, **scene, **SETTINGS)
     expected = dense_relax(positions, before, is_wall, **scene, **SETTINGS)
     moved = scene["box"].displacement(expected, positions).abs().max()
     assert moved > 0.05 * scene["particle_spacing"]
@@ -254,7 +264,8 @@ def test_positions_that_are_not_finite_are_refused(generator):
         relax(positions, before, is_wall, **scene, **SETTINGS)
 
 
-def test_a_shift_of_more_than_a_spacing_is_no_relaxation(generator):
+@pytest.mark.parametrize("relaxed", [relax, relax_on_device])
+def test_a_shift_of_more_than_a_spacing_is_no_relaxation(relaxed, generator):
     positions, before, is_wall, scene = cloud(2, generator)
     with pytest.raises(SimulationError, match="alpha 5 shifted a particle by .* particle spacings in one loop"):
-        relax(positions, before, is_wall, **scene, alpha=5.0)
+        relaxed(positions, before, is_wall, **scene, alpha=5.0)
