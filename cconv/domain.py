@@ -59,6 +59,13 @@ class Box:
         """Edge lengths, D numbers."""
         return tuple(high - low for low, high in zip(self.lower, self.upper, strict=True))
 
+    @property
+    def shortest_period(self) -> float:
+        """Length of the shortest periodic axis; infinite without one."""
+        return min(
+            (length for length, wraps in zip(self.lengths, self.periodic, strict=True) if wraps), default=math.inf
+        )
+
     def displacement(
         self, to: Float[Tensor, "*#points D"], origin: Float[Tensor, "*#points D"]
     ) -> Float[Tensor, "... D"]:

@@ -122,7 +122,10 @@ def inspect(
     as_json: AsJson = False,
     cutoff: Annotated[
         float | None,
-        typer.Option(help="Radius within which neighbours are counted; twice the particle spacing by default."),
+        typer.Option(
+            help="Radius within which neighbours are counted; by default twice the particle spacing, or half of the "
+            "shortest periodic axis if that is less."
+        ),
     ] = None,
     mass: Mass = None,
     particle_spacing: Spacing = None,

@@ -37,7 +37,14 @@ FEW = 8  # particles, of which neither densities nor equal frames tell anything
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame, counted from the first of the trajectory, a fluid particle of it, and what is wrong."""
+    """What a check found.
+
+    Attributes:
+        frame: Frame, counted from the first one that was looked at.
+        particle: Number of the particle among the fluid ones; None if it concerns all.
+        text: What is wrong, and what to do.
+        stops: Whether nothing can be learned from such data.
+    """
 
     frame: int
     particle: int | None
@@ -48,11 +55,16 @@ class Seen:
 class Fluid:
     """The fluid particles of a trajectory, as the checks look at them.
 
+    Args:
+        trajectory: The trajectory, or a piece of it.
+        scene: Its scene.
+        fluid: Numbers of the fluid particles among all stored ones, (N,).
+
     Attributes:
-        positions: (T, N, D).
-        velocities: (T, N, D).
-        steps: Minimum-image displacements from frame to frame, (T - 1, N, D).
-        speeds: (T, N).
+        positions: (T, N, D), length.
+        velocities: (T, N, D), length per time.
+        steps: Minimum-image displacements from frame to frame, (T - 1, N, D), length.
+        speeds: (T, N), length per time.
         masses: (N,).
         numbers: Numbers of the fluid particles among all stored ones, (N,).
     """
@@ -72,7 +84,7 @@ class Fluid:
 
     @cached_property
     def nearest(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """What `_nearest_in` finds, by frame, evenly spaced from the first to the last; none for a single particle."""
+        """Distances to the nearest other particle, and its number, each (N,), by frame; empty for a single particle."""
         frames = evenly_spaced(len(self.positions), FRAMES_WITH_NEIGHBORS) if len(self.numbers) > 1 else ()
         return {frame: self._nearest_in(frame) for frame in frames}
 
@@ -81,8 +93,7 @@ class Fluid:
         """Sums of kernels over all particles times dx^D, by frame; 1 on a lattice. Empty where they cannot be."""
         scene, particles = self.scene, self.trajectory
         reach = QuinticSpline(scene.particle_spacing, scene.dim).support_radius
-        wrapping = [length for length, wraps in zip(scene.box.lengths, scene.box.periodic, strict=True) if wraps]
-        if len(self.numbers) < FEW or min(wrapping, default=math.inf) < 2 * reach:
+        if len(self.numbers) < FEW or scene.box.shortest_period < 2 * reach:
             return {}
         stored = particles.particle_types != ParticleType.PAD
         found = {}
@@ -251,8 +262,8 @@ def _neighbors(fluid: Fluid) -> Seen | None:
         mean = mean_neighbors(fluid.positions[frame], cutoff)
         if mean > MANY_NEIGHBORS:
             text = (
-                f"fluid particles have {mean:.0f} neighbours within {cutoff:.3g}, {USUAL_CUTOFF} particle spacings; "
-                f"give --particle-spacing (about {np.median(distances):.3g})"
+                f"fluid particles have about {mean:.0f} neighbours within {cutoff:.3g}, {USUAL_CUTOFF} particle "
+                f"spacings; give --particle-spacing (about {np.median(distances):.3g})"
             )
             return Seen(frame, None, text, stops=True)
     return None

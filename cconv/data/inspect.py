@@ -1,6 +1,5 @@
 """Plain facts about a data set, and its implausibilities."""
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 
@@ -37,7 +36,8 @@ def inspect_dataset(
         ConfigError: If the cutoff is not positive, exceeds half of a periodic axis or holds far too many neighbours.
     """
     scene = dataset.scene
-    cutoff = _usual_cutoff(scene) if cutoff is None else cutoff
+    usual = min(USUAL_CUTOFF * scene.particle_spacing, scene.box.shortest_period / 2)
+    cutoff = usual if cutoff is None else cutoff
     collected: dict[ParticleType | str, list] = defaultdict(list)
     splits, findings, shared = {}, [], SharedFrames()
     for split, blocks in dataset.splits.items():
@@ -59,11 +59,6 @@ def inspect_dataset(
         "missing": list(scene.missing),
         "findings": [finding.as_dict() for finding in first_of_each(findings)],
     }
-
-
-def _usual_cutoff(scene: Scene) -> float:
-    wrapping = [length for length, wraps in zip(scene.box.lengths, scene.box.periodic, strict=True) if wraps]
-    return min(USUAL_CUTOFF * scene.particle_spacing, *(length / 2 for length in wrapping), math.inf)
 
 
 def _scene_facts(scene: Scene) -> dict:
@@ -131,8 +126,8 @@ def _check_affordable(positions: torch.Tensor, cutoff: float) -> None:
     mean = mean_neighbors(positions, cutoff) if cutoff > 0 else 0.0
     if mean > MOST_NEIGHBORS:
         raise ConfigError(
-            f"`cutoff` {cutoff:g} holds {mean:.0f} neighbours a particle, at most {MOST_NEIGHBORS} are counted; give a "
-            "smaller --cutoff, or a --particle-spacing that fits, as it is twice that by default."
+            f"`cutoff` {cutoff:g} holds about {mean:.0f} neighbours a particle, at most {MOST_NEIGHBORS} are counted; "
+            "give a smaller --cutoff, or a --particle-spacing that fits, as it is at most twice that by default."
         )
 
 

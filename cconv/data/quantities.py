@@ -11,7 +11,7 @@ from cconv.sph.compiled import compiled_sums
 from cconv.sph.kernels import QuinticSpline
 
 MOST_NEIGHBORS = 2000  # that are counted for a particle; usual are 10 to 60
-PARTICLES_COUNTED = 1000  # for a mean number of neighbours
+_PARTICLES_COUNTED = 1000  # for a mean number of neighbours
 _BLOCK = 200_000  # particles whose pairs are listed at once: about 1 GB in 3D
 
 
@@ -52,5 +52,5 @@ def mean_neighbors(positions: Tensor, radius: float) -> float:
     It is that of a thousand particles, evenly spaced in storage, where there are more.
     """
     points = positions.double().numpy()
-    asked = points[evenly_spaced(len(points), PARTICLES_COUNTED)]
+    asked = points[evenly_spaced(len(points), _PARTICLES_COUNTED)]
     return float(cKDTree(points).query_ball_point(asked, radius, return_length=True).mean())

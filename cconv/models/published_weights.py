@@ -59,8 +59,7 @@ def read_published(path: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor
             }
     except (OSError, RuntimeError, KeyError) as error:
         raise DataError(
-            f"{path}: cannot be read as HDF5 ({str(error).splitlines()[0][:200]}); give the published weights as .h5, "
-            "no pickle."
+            f"{path}: cannot be read as HDF5 ({one_line(error)}); give the published weights as .h5, no pickle."
         ) from error
 
 
@@ -76,6 +75,8 @@ def _read(file: h5py.File, layer: str, member: str, shape: tuple[int, ...]) -> T
             f"{place} must have shape {tuple(shape)} and type float32, got {found.shape} and "
             f"{one_line(found.dtype, 100)}; only the published ConvNet can be imported."
         )
+    if found.external or found.is_virtual:
+        raise DataError(f"{place} is kept outside the file; download the file again.")
     check_stored(found, path.parent, place)
     values = torch.from_numpy(found[()])
     if not torch.isfinite(values).all():

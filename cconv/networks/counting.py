@@ -61,7 +61,8 @@ class CountedCost:
     Attributes:
         flops_per_particle: Multiplications and additions of the network.
         bytes_per_particle: Bytes moved by neighbour search, geometry and network. Filters are assumed to stay in the
-            cache, so only the values that each pair reads from them are counted.
+            cache, so only the values that each pair reads from them are counted; so are columns of radial layers, which
+            are counted once a particle.
     """
 
     flops_per_particle: float = 0.0

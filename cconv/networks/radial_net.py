@@ -297,7 +297,11 @@ class RadialNetSettings(ConvolutionSettings):
         return own if self.message in ("absolute", "difference") else Kinds(own.scalars, max(0, own.vectors - 1))
 
     def _count_conv(self, conv: CountedConv, dim: int) -> CountedCost:
-        """Pairs read filters themselves where these are few; else messages are gathered into columns of terms."""
+        """Pairs read filters themselves where these are few; else messages are gathered into columns of terms.
+
+        The bytes of both differ at `MOST_READS`, since what a pair reads of filters is counted and what it adds to
+        columns is not.
+        """
         (scalars, vectors), (to_scalars, to_vectors), neighbors = conv.inputs, conv.outputs, conv.pairs.neighbors
         reads = num_reads(conv.inputs, conv.outputs, dim)
         if reads <= MOST_READS:

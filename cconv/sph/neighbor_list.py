@@ -46,7 +46,7 @@ class NeighborList:
     """
 
     def __init__(self, box: Box, reach: float, skin: float):
-        _check_wide_enough(box, reach + skin)
+        check_wide_enough(box, reach + skin)
         self._box, self._reach, self._skin = box, reach, skin
         self._lengths = periodic_lengths(box)
         self._searched_at, self._walls_then = np.empty((0, 3)), np.empty(0, bool)
@@ -92,7 +92,8 @@ def moved(positions: np.ndarray, velocities: np.ndarray, time_step: float, box: 
     return later
 
 
-def _check_wide_enough(box: Box, reach: float) -> None:
+def check_wide_enough(box: Box, reach: float) -> None:
+    """Raise `ConfigError` if a periodic axis is too short for a pair within reach to have one nearest image."""
     for axis, (length, periodic) in enumerate(zip(box.lengths, box.periodic, strict=True)):
         if periodic and length < 2 * reach:
             raise ConfigError(

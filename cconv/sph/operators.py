@@ -33,7 +33,7 @@ def density(masses: Float[Tensor, " M"], edges: Edges, kernel: AbstractKernel) -
         ConfigError: If the edges do not reach as far as the kernel, or differ from it in dimension.
     """
     check_sum(edges, kernel, masses=(masses, (edges.num_senders,)))
-    rho = _sum_over_neighbours(masses[edges.senders] * kernel.value(edges.distances), edges)
+    rho = sum_over_neighbors(masses[edges.senders] * kernel.value(edges.distances), edges)
     if edges.bipartite or edges.includes_self:
         return rho
     return rho + masses * kernel.value(masses.new_zeros(()))
@@ -64,7 +64,7 @@ def density_rate(
     check_sum(edges, kernel, masses=(masses, (particles,)), velocities=(velocities, (particles, edges.dim)))
     difference = velocities[edges.receivers] - velocities[edges.senders]
     terms = masses[edges.senders] * (difference * kernel_gradient(edges, kernel)).sum(dim=1)
-    return _sum_over_neighbours(terms, edges)
+    return sum_over_neighbors(terms, edges)
 
 
 def density_gradient(
@@ -95,7 +95,7 @@ def density_gradient(
     check_sum(edges, kernel, masses=(masses, (particles,)), densities=(densities, (particles,)))
     difference = densities[edges.senders] - densities[edges.receivers]
     terms = (masses[edges.senders] * difference)[:, None] * kernel_gradient(edges, kernel)
-    return _sum_over_neighbours(terms, edges) / densities[:, None]
+    return sum_over_neighbors(terms, edges) / densities[:, None]
 
 
 def velocity_gradient(
@@ -125,7 +125,7 @@ def velocity_gradient(
     particles = edges.num_senders
     check_sum(edges, kernel, volumes=(volumes, (particles,)), velocities=(velocities, (particles, edges.dim)))
     difference = volumes[edges.senders, None] * (velocities[edges.senders] - velocities[edges.receivers])
-    return _sum_over_neighbours(difference[:, :, None] * kernel_gradient(edges, kernel)[:, None, :], edges)
+    return sum_over_neighbors(difference[:, :, None] * kernel_gradient(edges, kernel)[:, None, :], edges)
 
 
 def interpolate(
@@ -151,8 +151,8 @@ def interpolate(
     check_sum(edges, kernel, volumes=(volumes, (senders,)), values=(values, (senders, "components")))
     weights = volumes[edges.senders] * kernel.value(edges.distances)
     return (
-        _sum_over_neighbours(weights[:, None] * values[edges.senders], edges)
-        / _sum_over_neighbours(weights, edges)[:, None]
+        sum_over_neighbors(weights[:, None] * values[edges.senders], edges)
+        / sum_over_neighbors(weights, edges)[:, None]
     )
 
 
@@ -163,7 +163,8 @@ def kernel_gradient(edges: Edges, kernel: AbstractKernel) -> Float[Tensor, "E D"
     return kernel.derivative(edges.distances)[:, None] * direction
 
 
-def _sum_over_neighbours(terms: Tensor, edges: Edges) -> Tensor:
+def sum_over_neighbors(terms: Tensor, edges: Edges) -> Tensor:
+    """Sums (N, ...) of the terms (E, ...) of each receiver's pairs."""
     return terms.new_zeros(edges.num_receivers, *terms.shape[1:]).index_add(0, edges.receivers, terms)
 
 

@@ -17,30 +17,26 @@ as in the authors' code wherever their data have walls. Differences from that co
 wrap, where it wraps all of them; the constant of the kernel in three dimensions is 1/(120π), where it has 3/(359π),
 0.28 % more.
 
-Sums over pairs are those of the solver, compiled for the CPU; other devices take torch operations.
+Sums over pairs are those of the solver, compiled for the CPU (`compiled_relaxation`); other devices take torch
+operations (`tensor_relaxation`).
 """
 
 import math
-from functools import lru_cache
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cconv.devices import finest_dtype
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, SimulationError, check_shape
-from cconv.sph import pair_loops, tensor_relaxation
-from cconv.sph.kernel_table import kernel_tables
+from cconv.sph.compiled_relaxation import SKIN, CompiledParticles
 from cconv.sph.kernels import QuinticSpline
-from cconv.sph.neighbor_list import NeighborList, moved, padded, periodic_lengths, unpadded
-from cconv.sph.solver import EquationOfState
+from cconv.sph.neighbor_list import check_wide_enough
+from cconv.sph.tensor_relaxation import TensorParticles
 
-LEAST_DENSITY, MOST_DENSITY = 0.98, 1.02  # of that at rest; from the text of the paper
 FARTHEST_SHIFT = 1.0  # particle spacings in a loop
-_FLUID = EquationOfState(rest_density=1.0, sound_speed=10.0)
-_SKIN = 0.3  # of the neighbour list, in particle spacings
 
 
 def relax(
@@ -80,10 +76,28 @@ def relax(
     """
     check_relaxation(alpha, beta, loops)
     _check_particles(positions, before, is_wall, box, particle_spacing)
-    relaxed = (_relaxed if positions.device.type == "cpu" else _relaxed_on_device)(
-        positions.detach(), before.detach(), is_wall, box, particle_spacing, alpha, beta, loops
-    )
-    return torch.where(is_wall[:, None], positions, box.wrap(relaxed.to(positions)))
+    particles: type[_Particles] = CompiledParticles if positions.device.type == "cpu" else TensorParticles
+    relaxed = particles(positions.detach(), before.detach(), is_wall, box, particle_spacing)
+    for _ in range(loops):
+        shifts = alpha * relaxed.shifts(beta)
+        _check_shifts(shifts, particle_spacing, alpha)
+        relaxed.move(shifts)
+    return torch.where(is_wall[:, None], positions, box.wrap(relaxed.positions.to(positions)))
+
+
+class _Particles(Protocol):
+    """Particles that are shifted; shifts are arrays or tensors."""
+
+    def __init__(
+        self, positions: Tensor, before: Tensor, is_wall: Tensor, box: Box, particle_spacing: float
+    ) -> None: ...
+
+    @property
+    def positions(self) -> Tensor: ...
+
+    def shifts(self, beta: float) -> Any: ...
+
+    def move(self, shifts: Any) -> None: ...
 
 
 def check_relaxation(alpha: float, beta: float, loops: int) -> None:
@@ -93,108 +107,6 @@ def check_relaxation(alpha: float, beta: float, loops: int) -> None:
             raise ConfigError(f"`{name}` of a relaxation must be a number from 0 on, got {value}.")
     if loops < 1:
         raise ConfigError(f"`loops` of a relaxation must be at least 1, got {loops}.")
-
-
-def _relaxed(
-    positions: Tensor,
-    before: Tensor,
-    is_wall: Tensor,
-    box: Box,
-    particle_spacing: float,
-    alpha: float,
-    beta: float,
-    loops: int,
-) -> Tensor:
-    """Positions after the shifts, by compiled loops."""
-    forces = _Forces(box, particle_spacing, is_wall.numpy())
-    shifted = positions.double()
-    places, displacements = padded(shifted), padded(box.displacement(shifted, before.double()))
-    for _ in range(loops):
-        shifts = alpha * forces.shifts(places, displacements, beta)
-        _check_shifts(shifts, particle_spacing, alpha)
-        places, displacements = moved(places, shifts, 1.0, box), displacements + shifts
-    return unpadded(places, box.dim)
-
-
-def _relaxed_on_device(
-    positions: Tensor,
-    before: Tensor,
-    is_wall: Tensor,
-    box: Box,
-    particle_spacing: float,
-    alpha: float,
-    beta: float,
-    loops: int,
-) -> Tensor:
-    """Positions after the shifts, by torch operations on the device of the positions."""
-    places = positions.to(finest_dtype(positions.device))
-    displacements = box.displacement(places, before.to(places))
-    for _ in range(loops):
-        shifts = alpha * tensor_relaxation.shifts(
-            places,
-            displacements,
-            is_wall,
-            box=box,
-            particle_spacing=particle_spacing,
-            beta=beta,
-            densities_within=(LEAST_DENSITY, MOST_DENSITY),
-            stiffness=_FLUID.reference_pressure,
-        )
-        _check_shifts(shifts, particle_spacing, alpha)
-        places, displacements = box.wrap(places + shifts), displacements + shifts
-    return places
-
-
-class _Forces:
-    """Shifts of particles by pressure and viscosity.
-
-    Args:
-        box: Domain with its periodic axes.
-        particle_spacing: dx.
-        is_wall: Which particles are walls (N,).
-    """
-
-    def __init__(self, box: Box, particle_spacing: float, is_wall: np.ndarray):
-        self._support, self._values, self._slopes = _kernel(particle_spacing, box.dim)
-        self._neighbors = NeighborList(box, self._support, _SKIN * particle_spacing)
-        self._lengths, self._is_wall, self._particle_spacing = periodic_lengths(box), is_wall, particle_spacing
-        self._masses = np.full(len(is_wall), particle_spacing**box.dim)
-
-    def shifts(self, positions: np.ndarray, displacements: np.ndarray, beta: float) -> np.ndarray:
-        """Shifts (N, 3) for an alpha of 1, length; zero for walls."""
-        rows = self._neighbors.rows(positions, self._is_wall)
-        densities = self._densities(positions)
-        pressures, velocities = _FLUID.pressure(densities), displacements.copy()
-        none = np.zeros_like(positions)
-        rows.visit(
-            pair_loops.extrapolate_to_walls, positions, self._lengths, self._support, self._values, self._is_wall,
-            none, densities, pressures, displacements, displacements, velocities, velocities,
-        )  # fmt: skip
-        densities = np.where(self._is_wall, _FLUID.density(pressures), densities)
-        accelerations = np.zeros_like(positions)
-        viscosities = np.full(len(positions), float(beta))
-        rows.visit(
-            pair_loops.accelerations, positions, self._lengths, self._masses, self._support, self._slopes,
-            self._is_wall, velocities, velocities, densities, pressures, viscosities, True, 0.0, 0.0, 0.0,
-            accelerations, none,
-        )  # fmt: skip
-        return self._particle_spacing**2 * accelerations
-
-    def _densities(self, positions: np.ndarray) -> np.ndarray:
-        """Densities (N,) of the fluid relative to that at rest, within the limits; 1 for walls."""
-        summed = np.ones(len(positions))
-        self._neighbors.rows(positions, self._is_wall).visit(
-            pair_loops.sum_densities, positions, self._lengths, self._masses, self._support, self._values,
-            self._is_wall, summed,
-        )  # fmt: skip
-        return np.where(summed < LEAST_DENSITY, 1.0, np.minimum(summed, MOST_DENSITY))
-
-
-@lru_cache(maxsize=8)
-def _kernel(particle_spacing: float, dim: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Support radius and tables of W and dW/dr, which a rollout needs again in every frame."""
-    kernel = QuinticSpline(particle_spacing, dim)
-    return kernel.support_radius, *kernel_tables(kernel)
 
 
 def _check_particles(positions: Tensor, before: Tensor, is_wall: Tensor, box: Box, particle_spacing: float) -> None:
@@ -208,6 +120,7 @@ def _check_particles(positions: Tensor, before: Tensor, is_wall: Tensor, box: Bo
         raise ShapeError("`positions` and `before` must be finite, got NaN or infinity.")
     if not 0 < particle_spacing < math.inf:
         raise ConfigError(f"`particle_spacing` must be positive, got {particle_spacing}.")
+    check_wide_enough(box, QuinticSpline(particle_spacing, box.dim).support_radius + SKIN * particle_spacing)
 
 
 def _check_shifts(shifts: np.ndarray | Tensor, particle_spacing: float, alpha: float) -> None:

@@ -6,75 +6,62 @@ smoothed particle hydrodynamics" (2013), eq. 8, with kernels computed exactly, w
 """
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cconv.devices import finest_dtype
 from cconv.domain import Box
 from cconv.neighbors import Edges, radius_graph
+from cconv.sph.compiled_relaxation import FLUID, LEAST_DENSITY, MOST_DENSITY
 from cconv.sph.kernels import QuinticSpline
+from cconv.sph.operators import density, sum_over_neighbors
 
 
-def shifts(
-    positions: Float[Tensor, "N D"],
-    displacements: Float[Tensor, "N D"],
-    is_wall: Bool[Tensor, " N"],
-    *,
-    box: Box,
-    particle_spacing: float,
-    beta: float,
-    densities_within: tuple[float, float],
-    stiffness: float,
-) -> Float[Tensor, "N D"]:
-    """Shifts of the fluid by pressure and viscosity for an alpha of 1, length; zero for walls.
+class TensorParticles:
+    """Particles that are shifted by pressure and viscosity; arguments as of `CompiledParticles`, on any device."""
 
-    Args:
-        positions: x (N, D), length.
-        displacements: u (N, D), length per frame.
-        is_wall: Which particles are walls (N,).
-        box: Domain with its periodic axes, each at least six particle spacings long.
-        particle_spacing: dx, length.
-        beta: Viscosity relative to the pressure.
-        densities_within: Below the first, of that at rest, a density counts as at rest, above the second as the second.
-        stiffness: p of a density ρ is this times ρ - 1.
+    def __init__(self, positions: Tensor, before: Tensor, is_wall: Tensor, box: Box, particle_spacing: float):
+        self.positions = positions.to(finest_dtype(positions.device))
+        self._displacements = box.displacement(self.positions, before.to(self.positions))
+        self._is_wall, self._box, self._particle_spacing = is_wall, box, particle_spacing
+        self._kernel = QuinticSpline(particle_spacing, box.dim)
 
-    Raises:
-        ConfigError: If the box is too narrow.
-    """
-    kernel = QuinticSpline(particle_spacing, box.dim)
-    edges = radius_graph(positions, kernel.support_radius, box)
-    volume = particle_spacing**box.dim
-    weights = kernel.value(edges.distances)
-    least, most = densities_within
-    summed = volume * (kernel.value(weights.new_zeros(())) + _summed(weights, edges))
-    fluid = torch.where((summed < least) | is_wall, 1.0, summed.clamp(max=most))
-    pressures, velocities = _at_walls(stiffness * (fluid - 1), displacements, is_wall, weights, edges)
-    densities = torch.where(is_wall, (pressures / stiffness + 1).clamp(min=0), fluid)
-    i, j = edges.receivers, edges.senders
-    apart = edges.distances > 0
-    slopes = kernel.derivative(edges.distances) / torch.where(apart, edges.distances, 1.0)
-    prefactors = volume * (densities[i] ** -2 + densities[j] ** -2) * slopes * apart
-    mean_pressures = (densities[j] * pressures[i] + densities[i] * pressures[j]) / (densities[i] + densities[j])
-    terms = -mean_pressures[:, None] * edges.displacements + beta * (displacements[i] - velocities[j])
-    accelerations = _summed(prefactors[:, None] * terms, edges)
-    return torch.where(is_wall[:, None], 0.0, particle_spacing**2 * accelerations)
+    def move(self, shifts: Tensor) -> None:
+        """Shift the particles by (N, D)."""
+        self.positions = self._box.wrap(self.positions + shifts)
+        self._displacements = self._displacements + shifts
 
+    def shifts(self, beta: float) -> Tensor:
+        """Shifts (N, D) for an alpha of 1, length; zero for walls."""
+        edges = radius_graph(self.positions, self._kernel.support_radius, self._box)
+        stiffness, own = FLUID.reference_pressure, self._densities(edges)
+        pressures, velocities = self._at_walls(stiffness * (own - 1), edges)
+        densities = torch.where(self._is_wall, pressures / stiffness + 1, own)
+        i, j = edges.receivers, edges.senders
+        apart = edges.distances > 0
+        slopes = self._kernel.derivative(edges.distances) / torch.where(apart, edges.distances, 1.0)
+        volume = self._particle_spacing**self._box.dim
+        prefactors = volume * (densities[i] ** -2 + densities[j] ** -2) * slopes * apart
+        mean_pressures = (densities[j] * pressures[i] + densities[i] * pressures[j]) / (densities[i] + densities[j])
+        terms = beta * (self._displacements[i] - velocities[j]) - mean_pressures[:, None] * edges.displacements
+        accelerations = sum_over_neighbors(prefactors[:, None] * terms, edges)
+        return torch.where(self._is_wall[:, None], 0.0, self._particle_spacing**2 * accelerations)
 
-def _at_walls(
-    pressures: Tensor, displacements: Tensor, is_wall: Tensor, weights: Tensor, edges: Edges
-) -> tuple[Tensor, Tensor]:
-    """Pressures and velocities with those of walls from the fluid near them; 0 and its own for one without any."""
-    of_fluid = torch.where(is_wall[edges.senders], 0.0, weights)
-    total = _summed(of_fluid, edges)
-    near = is_wall & (total > 0)
-    divisor = torch.where(near, total, 1.0)
-    pressure = _summed(of_fluid * pressures[edges.senders], edges) / divisor
-    velocity = _summed(of_fluid[:, None] * displacements[edges.senders], edges) / divisor[:, None]
-    return (
-        torch.where(is_wall, torch.where(near, pressure, 0.0), pressures),
-        torch.where(near[:, None], 2 * displacements - velocity, displacements),
-    )
+    def _densities(self, edges: Edges) -> Tensor:
+        """Densities (N,) of the fluid relative to that at rest, within the limits; 1 for walls."""
+        masses = torch.full_like(self.positions[:, 0], self._particle_spacing**self._box.dim)
+        summed = density(masses, edges, self._kernel)
+        return torch.where((summed < LEAST_DENSITY) | self._is_wall, 1.0, summed.clamp(max=MOST_DENSITY))
 
-
-def _summed(terms: Tensor, edges: Edges) -> Tensor:
-    """Sum the terms of all pairs of each receiver."""
-    return terms.new_zeros(edges.num_receivers, *terms.shape[1:]).index_add(0, edges.receivers, terms)
+    def _at_walls(self, pressures: Tensor, edges: Edges) -> tuple[Tensor, Tensor]:
+        """Pressures and velocities with those of walls from the fluid near them; 0 and its own for one without any."""
+        is_wall, displacements = self._is_wall, self._displacements
+        weights = torch.where(is_wall[edges.senders], 0.0, self._kernel.value(edges.distances))
+        total = sum_over_neighbors(weights, edges)
+        near = is_wall & (total > 0)
+        divisor = torch.where(near, total, 1.0)
+        pressure = sum_over_neighbors(weights * pressures[edges.senders], edges) / divisor
+        velocity = sum_over_neighbors(weights[:, None] * displacements[edges.senders], edges) / divisor[:, None]
+        return (
+            torch.where(is_wall, torch.where(near, pressure, 0.0), pressures),
+            torch.where(near[:, None], 2 * displacements - velocity, displacements),
+        )

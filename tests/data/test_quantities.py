@@ -3,7 +3,7 @@ from dataclasses import replace
 import torch
 from systems import periodic_frame, periodic_scene
 
-from cconv.data.quantities import density_deviation, speed
+from cconv.data.quantities import density_deviation, mean_neighbors, speed
 from cconv.domain import Box
 from cconv.neighbors import radius_graph
 from cconv.sph.kernels import QuinticSpline
@@ -53,3 +53,10 @@ def test_wall_particles_count(generator):
 def test_speed_is_the_length_of_the_velocity(generator):
     frame = replace(periodic_frame(generator), velocities=torch.tensor([[3.0, -4.0]]).expand(64, 2))
     assert torch.equal(speed(frame), torch.full((64,), 5.0))
+
+
+def test_a_mean_number_of_neighbours_is_exact_for_few_particles_and_near_for_many(generator):
+    few, many = (torch.rand(count, 2, generator=generator, dtype=torch.float64) for count in (900, 6000))
+    for points, off in ((few, 1e-12), (many, 0.05)):
+        exact = float((torch.cdist(points, points) <= 0.1).sum(dim=1).double().mean())
+        assert abs(mean_neighbors(points, 0.1) / exact - 1) <= off

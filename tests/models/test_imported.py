@@ -146,6 +146,25 @@ def replaced(name, values):
 
 
 NAME = member("dense2", "kernel")
+
+
+def external(file):
+    del file[NAME]
+    file.create_dataset(NAME, (64, 64), "f4", external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file):
+    del file[NAME]
+    layout = h5py.VirtualLayout((64, 64), "f4")
+    layout[:] = h5py.VirtualSource("other.h5", "values", (64, 64))
+    file.create_virtual_dataset(NAME, layout)
+
+
+def unwritten(file):
+    del file[NAME]
+    file.create_dataset(NAME, (64, 64), "f4")
+
+
 CHANGES = {
     "a missing tensor": (without(NAME), "is missing"),
     "another shape": (replaced(NAME, np.zeros((64, 63), np.float32)), "(64, 64)"),
@@ -157,6 +176,9 @@ CHANGES = {
         "(64, 64)",
     ),
     "a link that leads nowhere": (replaced(NAME, h5py.SoftLink("/nowhere")), "leads nowhere"),
+    "values outside the file": (external, "outside the file"),
+    "values of another file": (virtual, "outside the file"),
+    "never written": (unwritten, "never written"),
     "NaN": (replaced(NAME, np.full((64, 64), np.nan, np.float32)), "NaN"),
 }
 

@@ -134,6 +134,14 @@ def test_more_of_a_network_costs_more(name, values, architecture):
         assert counts == sorted(set(counts))
 
 
+def test_columns_of_wide_radial_layers_are_counted_once_a_particle():
+    """Four bytes at each term for 2 · 64 columns of scalars and 3 · 3 · 64 of vectors; the last layer has no vectors."""
+    sizes = {"architecture": "radial_net", "layers": 4, "first_channels": 64, "hidden_channels": 64, "walls": False}
+    few, many = (cost(sizes, radial_terms=terms).bytes_per_particle for terms in (8, 9))
+    wide = 4 * (2 * (2 * 64 + 3 * 3 * 64) + 2 * 64)
+    assert wide < many - few < 1.02 * wide
+
+
 def test_maps_windows_and_norms_move_memory_and_are_no_operations_of_the_network():
     plain = cost(mapping="identity", window="none")
     for changes in ({"mapping": "ball_to_cube_radial"}, {"window": "poly6"}, {"normalize": True}):

@@ -242,10 +242,11 @@ def test_single_precision_is_the_same_to_its_rounding(generator):
         ({"particle_spacing": 0.5}, "`box` must be at least 3.3 long on its periodic axis 0"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(changed, message, generator):
+@pytest.mark.parametrize("relaxed", [relax, relax_on_device])
+def test_settings_that_cannot_be_are_refused(changed, message, relaxed, generator):
     positions, before, is_wall, scene = cloud(2, generator)
     with pytest.raises(ConfigError, match=message):
-        relax(positions, before, is_wall, **scene | SETTINGS | changed)
+        relaxed(positions, before, is_wall, **scene | SETTINGS | changed)
 
 
 @pytest.mark.parametrize("name", ["positions", "before", "is_wall"])
