@@ -4,10 +4,10 @@
 
 The network is that of `experiments/rollout_taylor_green.toml`, its weights drawn at random, which does not change
 times. A training step draws a batch (with noise, so that nothing is cached), and takes losses and derivatives; a
-validation rolls all windows out for a few frames. Both ways take turns, so that other processes disturb them alike;
-ratios are of CPU time, medians with quartiles; wall times mean something on an idle machine only. Folders are in the
-LagrangeBench layout; those of periodic flows without walls, e.g. `cconv data generate taylor_green_2d --size small
---out FOLDER`. Writes `joined.json`.
+validation rolls all windows out for a few frames; a frame is the first of a rollout. Both ways take turns, so that
+other processes disturb them alike; ratios are of CPU time, medians with quartiles; wall times mean something on an idle
+machine only. Folders are in the LagrangeBench layout; those of periodic flows without walls, e.g. `cconv data generate
+taylor_green_2d --size small --out FOLDER`. Writes `joined.json`.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from cconv.data.dataset import open_dataset
 from cconv.data.window import Windows
 from cconv.evaluation.rollout_errors import rollouts_of
 from cconv.models.model import Model, build_model
+from cconv.rollout.rollout import rollout
 from cconv.study.studies import load_study
 from cconv.tasks import task_named
 from cconv.tasks.samples import WindowSamples
@@ -66,6 +67,13 @@ def training_step(samples: WindowSamples, model: Model) -> None:
 def validation(samples: WindowSamples, model: Model) -> None:
     """Rollouts from all windows."""
     rollouts_of(model, samples)
+
+
+def frame(samples: WindowSamples, model: Model) -> None:
+    """A frame of a rollout from each window."""
+    with torch.no_grad():
+        for sample in samples:
+            next(rollout(model, sample.window, sample.scene))
 
 
 def compared(work: Callable[[WindowSamples, Model], None], samples: WindowSamples, model: Model, rounds: int) -> dict:
@@ -113,7 +121,7 @@ def main() -> None:
     for folder in arguments.data:
         samples, model = problem_of(folder, arguments.windows)
         row: dict[str, Any] = {"data": folder.name, "particles": len(samples.window(0).masses)}
-        for work in (training_step, validation):
+        for work in (training_step, validation, frame):
             row[work.__name__] = compared(work, samples, model, 2 if arguments.smoke else arguments.rounds)
         results["data"].append(row)
         print(json.dumps(row))

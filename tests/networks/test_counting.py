@@ -135,7 +135,7 @@ def test_more_of_a_network_costs_more(name, values, architecture):
 
 
 def test_columns_of_wide_radial_layers_are_counted_once_a_particle():
-    """Four bytes at each term for 2 · 64 columns of scalars and 3 · 3 · 64 of vectors; the last layer has no vectors."""
+    """Four bytes a term for 2 · 64 columns of scalars and 3 · 3 · 64 of vectors; the last layer has no vectors."""
     sizes = {"architecture": "radial_net", "layers": 4, "first_channels": 64, "hidden_channels": 64, "walls": False}
     few, many = (cost(sizes, radial_terms=terms).bytes_per_particle for terms in (8, 9))
     wide = 4 * (2 * (2 * 64 + 3 * 3 * 64) + 2 * 64)
