@@ -119,7 +119,9 @@ def make_material(
     stored = [(each, index) for each in trajectories for index in range(len(each))]
     if not stored:
         raise DataError("There is no validation frame to test stability on; give the split at least one.")
-    chosen, few = (_read(stored, count) for count in (PLAIN_FRAMES, STRESSED_FRAMES))
+    places, few = (evenly_spaced(len(stored), count) for count in (PLAIN_FRAMES, STRESSED_FRAMES))
+    frames = {place: _read(*stored[place]) for place in sorted({*places, *few})}
+    chosen = [frames[place] for place in places]
     states = [task.state(frame, scene) for frame, _ in chosen]
     targets = [task.field(state) for state in states]
     typical = max(float(torch.cat(targets).var(dim=0, correction=0).mean()), _rounding(states, task))
@@ -132,7 +134,7 @@ def make_material(
         scene=scene,
         trajectory=trajectories[0],
         plain=tuple(plain),
-        few=few,
+        few=tuple(frames[place] for place in few),
         typical=typical,
         fastest=max(float(state.velocities.norm(dim=1).max()) for state in states),
         reach=max(reach or 0.0, states[0].kernel.support_radius),
@@ -151,14 +153,9 @@ def relative_error(predictor: Predictor, probe: Probe) -> float:
     return float(squared_errors(predictor, probe)[probe.affected].mean() / probe.scale)
 
 
-def _read(stored: Sequence[tuple[Frames, int]], count: int) -> tuple[tuple[Frame, str], ...]:
-    """So many of the stored frames, evenly spaced, each with where it is from."""
-    chosen = [stored[place] for place in evenly_spaced(len(stored), count)]
-    return tuple((trajectory[index], _origin(trajectory, index)) for trajectory, index in chosen)
-
-
-def _origin(trajectory: Frames, index: int) -> str:
-    return f"trajectory {trajectory.name}, frame {trajectory.first_frame + index}"
+def _read(trajectory: Frames, index: int) -> tuple[Frame, str]:
+    """A frame, and where it is from."""
+    return trajectory[index], f"trajectory {trajectory.name}, frame {trajectory.first_frame + index}"
 
 
 def _rounding(states: Sequence[FluidState], task: FieldTask) -> float:
