@@ -238,11 +238,13 @@ def measure_growth(
 
 
 def fluid_block(num_particles: int, field: ModelConfig, seed: int = 0) -> tuple[Frame, Scene]:
-    """Make a cube of fluid in open space: a jittered lattice with random velocities, on a layer of wall points.
+    """Make a cube of fluid in open space: a jittered lattice with random velocities, on a layer of walls.
+
+    Walls are points or particles at rest, as the model was trained beside them.
 
     Args:
         num_particles: Number of fluid particles; the topmost layer of the cube may be incomplete.
-        field: Configuration of the model: dimensions, particle spacing, features of boundary points.
+        field: Configuration of the model: dimensions, particle spacing, features of boundary points, types of walls.
         seed: Seed of jitter and velocities.
     """
     dim, spacing = field.dim, field.particle_spacing
@@ -251,16 +253,19 @@ def fluid_block(num_particles: int, field: ModelConfig, seed: int = 0) -> tuple[
     ticks = torch.arange(side) + 0.5
     lattice = torch.cartesian_prod(*[ticks] * dim).reshape(-1, dim)
     jitter = 0.2 * (torch.rand(num_particles, dim, generator=generator) - 0.5)
+    layer = lattice[: side ** (dim - 1)] - torch.eye(dim)[0]  # below the first axis, along which the cube fills up
+    walls = layer if field.wall_types else layer[:0]
+    kinds = torch.tensor(field.wall_types or (0,)).repeat(len(walls))[: len(walls)]  # of several types in turn
     boundary = None
-    if field.walls:  # below the first axis, along which the cube fills up
-        walls = lattice[: side ** (dim - 1)] - torch.eye(dim)[0]
-        normals = torch.eye(dim)[:1].expand_as(walls).clone() if field.walls.vectors else None
-        boundary = Boundary(positions=spacing * walls, normals=normals)
+    if field.walls:
+        normals = torch.eye(dim)[:1].expand_as(layer).clone() if field.walls.vectors else None
+        boundary = Boundary(positions=spacing * layer, normals=normals)
+    velocities = torch.randn(num_particles, dim, generator=generator)
     frame = Frame(
-        positions=spacing * (lattice[:num_particles] + jitter),
-        velocities=torch.randn(num_particles, dim, generator=generator),
-        masses=torch.full((num_particles,), spacing**dim),
-        particle_types=torch.full((num_particles,), int(ParticleType.FLUID)),
+        positions=spacing * torch.cat([lattice[:num_particles] + jitter, walls]),
+        velocities=torch.cat([velocities, torch.zeros_like(walls)]),
+        masses=torch.full((num_particles + len(walls),), spacing**dim),
+        particle_types=torch.cat([torch.full((num_particles,), int(ParticleType.FLUID)), kinds]),
         boundary=boundary,
     )
     return frame, _block_scene(field, side)

@@ -4,6 +4,7 @@ import statistics
 import pytest
 from systems import configured, periodic_frame, periodic_scene, problem
 
+from cconv.data.trajectory import ParticleType
 from cconv.evaluation import cost as costs
 from cconv.evaluation.cost import (
     ANALYTIC,
@@ -119,6 +120,16 @@ def test_a_block_is_fluid_of_the_spacing_on_a_wall(count, walls):
         points = len(block.wall_positions)
         near = radius_graph(block.wall_positions, 1.3, queries=block.positions)
         assert len(near) >= points * min(1, count / points) * 0.9
+
+
+def test_a_block_stands_on_particles_of_the_walls_that_a_model_knows():
+    frame, scene = fluid_block(100, field(2).model_copy(update={"wall_types": (1, 2)}))
+    fluid = frame.particle_types == ParticleType.FLUID
+    assert int(fluid.sum()) == 100
+    assert frame.particle_types[~fluid].tolist() == [1, 2] * 5
+    assert not frame.velocities[~fluid].any()
+    near = radius_graph(frame.positions[fluid], 1.3 * scene.particle_spacing, queries=frame.positions[~fluid])
+    assert len(near) >= 9
 
 
 def saved_models(generator, tmp_path):
