@@ -10,7 +10,7 @@ from cconv.study.stages.finalists import Retrained
 from cconv.study.stages.select import _stress
 
 
-def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
+def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path, monkeypatch):
     """One of two seeds predicts no numbers, and not the best one; the failures name it."""
     given = problem(generator)
     for seed in (1, 2):
@@ -22,10 +22,12 @@ def test_every_seed_of_a_finalist_is_stressed(generator, tmp_path):
     finalist = Retrained(id="baseline", records=records, checkpoints=[tmp_path / "1", tmp_path / "2"])
     session = SimpleNamespace(
         problem=given,
-        dataset=SimpleNamespace(scene=periodic_scene(), trajectories=lambda split: [periodic_trajectory(generator)]),
+        dataset=SimpleNamespace(scene=periodic_scene()),
         progress=lambda items, label: items,
         load_model=load_model,
     )
+    stored = [periodic_trajectory(generator)]
+    monkeypatch.setattr("cconv.study.stages.checked.kept_trajectories", lambda dataset, split: stored)
     checks, found = _stress(session, [finalist])
     assert list(checks) == list(given.task.checks)
     assert found["baseline"].counts.seeds == 2
