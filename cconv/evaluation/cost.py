@@ -254,8 +254,8 @@ def fluid_block(num_particles: int, field: ModelConfig, seed: int = 0) -> tuple[
     lattice = torch.cartesian_prod(*[ticks] * dim).reshape(-1, dim)
     jitter = 0.2 * (torch.rand(num_particles, dim, generator=generator) - 0.5)
     layer = lattice[: side ** (dim - 1)] - torch.eye(dim)[0]  # below the first axis, along which the cube fills up
-    walls = layer if field.wall_types else layer[:0]
-    kinds = torch.tensor(field.wall_types or (0,)).repeat(len(walls))[: len(walls)]  # of several types in turn
+    kinds = torch.tensor([*itertools.islice(itertools.cycle(field.wall_types), len(layer))], dtype=torch.int64)
+    walls = layer[: len(kinds)]  # particles of each type in turn; none where the model knows no type
     boundary = None
     if field.walls:
         normals = torch.eye(dim)[:1].expand_as(layer).clone() if field.walls.vectors else None

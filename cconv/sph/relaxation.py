@@ -31,9 +31,7 @@ from torch import Tensor
 
 from cconv.domain import Box
 from cconv.errors import ConfigError, ShapeError, SimulationError, check_shape
-from cconv.sph.compiled_relaxation import SKIN, CompiledParticles
-from cconv.sph.kernels import QuinticSpline
-from cconv.sph.neighbor_list import check_wide_enough
+from cconv.sph.compiled_relaxation import CompiledParticles
 from cconv.sph.tensor_relaxation import TensorParticles
 
 FARTHEST_SHIFT = 1.0  # particle spacings in a loop
@@ -120,7 +118,6 @@ def _check_particles(positions: Tensor, before: Tensor, is_wall: Tensor, box: Bo
         raise ShapeError("`positions` and `before` must be finite, got NaN or infinity.")
     if not 0 < particle_spacing < math.inf:
         raise ConfigError(f"`particle_spacing` must be positive, got {particle_spacing}.")
-    check_wide_enough(box, QuinticSpline(particle_spacing, box.dim).support_radius + SKIN * particle_spacing)
 
 
 def _check_shifts(shifts: np.ndarray | Tensor, particle_spacing: float, alpha: float) -> None:

@@ -11,8 +11,9 @@ from torch import Tensor
 from cconv.devices import finest_dtype
 from cconv.domain import Box
 from cconv.neighbors import Edges, radius_graph
-from cconv.sph.compiled_relaxation import FLUID, LEAST_DENSITY, MOST_DENSITY
+from cconv.sph.compiled_relaxation import FLUID, LEAST_DENSITY, MOST_DENSITY, SKIN
 from cconv.sph.kernels import QuinticSpline
+from cconv.sph.neighbor_list import check_wide_enough
 from cconv.sph.operators import density, sum_over_neighbors
 
 
@@ -24,6 +25,7 @@ class TensorParticles:
         self._displacements = box.displacement(self.positions, before.to(self.positions))
         self._is_wall, self._box, self._particle_spacing = is_wall, box, particle_spacing
         self._kernel = QuinticSpline(particle_spacing, box.dim)
+        check_wide_enough(box, self._kernel.support_radius + SKIN * particle_spacing)  # as the CPU's neighbour list
 
     def move(self, shifts: Tensor) -> None:
         """Shift the particles by (N, D)."""
