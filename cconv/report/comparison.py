@@ -16,6 +16,7 @@ from cconv.report.page import templates
 from cconv.report.plots import new_figure
 from cconv.report.published import BUDGET
 from cconv.report.scoreboard import OURS, matrix, scores_table
+from cconv.report.scoreboard_plots import scoreboard_chart
 from cconv.report.tables import speed_accuracy_table
 from cconv.study.records.summary import Summary
 
@@ -135,6 +136,7 @@ def write_comparison(runs: Sequence[ComparedRun], path: Path) -> None:
         differences=differences_table(runs).to_dict("records"),
         chart=fronts_chart(runs),
         scenes={scene: rows.to_dict("records") for scene, rows in scores.groupby("data", sort=False)},
+        scoreboard=None if scores.empty else scoreboard_chart(scores),
         matrix=matrix(scores),
         has_published=bool((scores["source"] != OURS).any()),
         published_budget=BUDGET,

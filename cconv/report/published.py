@@ -9,6 +9,7 @@ import pandas as pd
 from cconv.study.records.summary import Summary
 
 HORIZON = 20  # frames behind the published errors
+CHECKPOINTS = "checkpoints"  # the source with errors of pretrained networks
 BUDGET = "500,000 updates on an A6000"  # of every published network
 
 
@@ -35,5 +36,5 @@ def published_errors(summary: Summary) -> dict[str, float]:
     if summary.task.horizon != HORIZON:
         return {}
     found = published_results(summary)
-    found = found[found["source"] == "checkpoints"]
+    found = found[found["source"] == CHECKPOINTS]
     return dict(zip(found["network"], found["mse20"], strict=True))

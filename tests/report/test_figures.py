@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from matplotlib.figure import Figure
-from summaries import SAMPLE, whole_run_in
+from summaries import SAMPLE, compared_steps, whole_run_in
 
 from cconv.report import page
 from cconv.report.compared_runs import compared_runs
@@ -31,11 +31,14 @@ def drawn(monkeypatch):
     return figures
 
 
-@pytest.fixture(params=["report", "comparison"])
+@pytest.fixture(params=["report", "comparison", "scoreboard"])
 def shown(request, tmp_path, drawn):
     """A page with all kinds of figures, and the figures of matplotlib in it."""
     if request.param == "report":
         return page.render_report(whole_run_in(tmp_path)), drawn
+    if request.param == "scoreboard":
+        write_comparison([compared_steps()], tmp_path / "scoreboard.html")
+        return (tmp_path / "scoreboard.html").read_text(), drawn
     run = RunFolder(shutil.copytree(SAMPLE, tmp_path / "run"))
     write_comparison(compared_runs([RunFolder(SAMPLE), run]), tmp_path / "compared.html")
     return (tmp_path / "compared.html").read_text(), drawn

@@ -1,6 +1,7 @@
 """The scoreboard: a row is what its finalist measured, and what others report stands beside it for their data alone."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from cconv.report.compared_runs import ComparedRun, Inputs
 from cconv.report.comparison import write_comparison
 from cconv.report.published import published_errors, published_table
 from cconv.report.scoreboard import OURS, matrix, scores_table
+from cconv.report.scoreboard_plots import scoreboard_chart
 
 
 def test_rows_are_the_finalists_by_error_then_what_they_are_measured_by():
@@ -23,6 +25,35 @@ def test_rows_are_the_finalists_by_error_then_what_they_are_measured_by():
     assert (large["cpu_minutes"], large["hours"]) == (1.5, pytest.approx(3 / 3600))
     assert math.isnan(best["cpu_minutes"])
     assert (large["ci95_low"], large["ci95_high"]) == (1.5e-6, 6e-6)
+
+
+def test_a_network_with_too_few_test_trajectories_has_an_interval_over_trainings_alone():
+    few = {"ci95": None, "why_no_interval": "2 units say too little of others"}
+    trained = {"large": [2e-6, 3e-6, 3e-6, 4e-6], "one": [1e-6], "blown_up": [1e-6, 1e-2, 1e-5, 0.2]}
+    run = steps()
+    first, *others = run.summary.finalists
+    models = [
+        changed(first, id=name, test=changed(first.test, **few, by_seed=dict(zip("abcd", errors, strict=False))))
+        for name, errors in trained.items()
+    ]
+    beside = changed(run.summary, finalists=[*models, *others])
+    scores = scores_table([replace(run, summary=beside)]).set_index("model")
+    assert scores.loc["large", "of_trainings"] is True
+    assert 2e-6 < scores.loc["large", "ci95_low"] < 3e-6 < scores.loc["large", "ci95_high"] < 9e-6
+    assert scores.loc[["one", "blown_up"], "ci95_low"].isna().all()  # the latter would span decades
+    (whole,) = scores_table([steps()]).query("model == 'large'").to_dict("records")
+    assert whole["of_trainings"] is False
+
+
+def test_the_chart_has_a_panel_for_each_data_set_and_one_look_for_each_network():
+    folders = ["2D_TGV_2500_10kevery100", "2D_RPF_3200_20kevery100", "elsewhere"]
+    figure = scoreboard_chart(scores_table([steps(folder) for folder in folders]))
+    panels = [dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True)) for axes in figure.axes]
+    assert [axes.get_title() for axes in figure.axes] == folders
+    assert len({panel["large"].lines[0].get_color() for panel in panels}) == 1
+    published = [panel.get("GNS-10-128, published") for panel in panels]
+    assert [line is not None and line.get_ydata()[0] for line in published] == [5.9e-6, 4.0e-6, False]
+    assert all("SPH solver" in panel for panel in panels)
 
 
 def test_whole_rollouts_are_means_over_trainings_and_trajectories():
