@@ -300,6 +300,8 @@ def _records(table: "pd.DataFrame") -> list[dict]:
 
 
 def _answers_table(answers: "pd.DataFrame") -> Table:
+    from cconv.report.tables import error_interval
+
     table = Table(
         title="Recommended models: test error, ms per frame, the solver's frame as a multiple",
         title_justify="left",
@@ -313,7 +315,7 @@ def _answers_table(answers: "pd.DataFrame") -> Table:
             row.study,
             f"{row.parameters:,}",
             f"{row.error:.3g}",
-            "none" if math.isnan(row.ci95_low) else f"{row.ci95_low:.2g}–{row.ci95_high:.2g}",
+            "none" if math.isnan(row.ci95_low) else error_interval(row.ci95_low, row.ci95_high, digits=2),
             f"{row.ms_per_frame:.3g}",
             "–" if math.isnan(row.solver) else f"{row.solver:.2f}",
             "yes" if row.stable else "no",
@@ -345,6 +347,8 @@ def _count(value: float) -> str:
 
 
 def _finalists_table(summary: "Summary") -> Table:
+    from cconv.report.tables import error_interval
+
     table = Table(
         title=f"{summary.study}: test error ({summary.task.error}) and cost of the finalists",
         title_justify="left",
@@ -358,7 +362,7 @@ def _finalists_table(summary: "Summary") -> Table:
         table.add_row(
             entry.id + mark,
             f"{entry.test.error:.4g}",
-            "none" if entry.test.ci95 is None else "{:.3g}–{:.3g}".format(*entry.test.ci95),
+            "none" if entry.test.ci95 is None else error_interval(*entry.test.ci95),
             f"{entry.cost.ms_per_frame:.2f}",
             f"{entry.num_parameters:,}",
             "yes" if entry.stability.stable else "no",

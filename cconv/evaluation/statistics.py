@@ -19,7 +19,6 @@ RESOLUTION = 0.05  # relative difference of two times that is too small to choos
 
 FEWEST = 4  # smallest number of seeds or units with an interval
 SMALLEST_ERROR = 1e-14  # share of the variance: the square of the resolution of float32; smaller errors count as this
-WIDEST = 1e3  # ratio of the ends of an interval from which on it tells nothing
 _DRAWS = 20_000
 
 
@@ -56,29 +55,6 @@ def why_no_interval(seeds: int, units: int) -> str:
     if 1 < seeds < FEWEST:
         return f"{seeds} seeds say {needed}"
     return ""
-
-
-def stated_interval(errors: np.ndarray) -> tuple[tuple[float, float] | None, str]:
-    """Compute `crossed_interval`, or tell why none is stated.
-
-    Args:
-        errors: Errors (seeds, units), positive; one row for a model without seeds.
-
-    Returns:
-        The interval and "", or None and the reason: too few draws, or errors so different that it spans a factor of
-        more than `WIDEST`, as those of a few trainings some of which blow up.
-
-    Raises:
-        ShapeError: If `errors` is no table.
-        DataError: If an error is negative or not finite.
-    """
-    interval = crossed_interval(errors)
-    if interval is None:
-        return None, why_no_interval(*errors.shape)
-    low, high = interval
-    if high > WIDEST * low:
-        return None, f"errors differ so much that it would span a factor of more than {WIDEST:g}"
-    return interval, ""
 
 
 def crossed_interval(errors: np.ndarray, *, seed: int = 0) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ import plotly.io
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
 from cconv.report.published import published_errors
 from cconv.report.speed_accuracy import error_range
-from cconv.report.tables import MEAN_PREDICTOR, speed_accuracy_table
+from cconv.report.tables import MEAN_PREDICTOR, error_interval, speed_accuracy_table
 from cconv.study.records.summary import Front, Summary
 
 _SYMBOLS = {"recommended": "star", "baseline": "square", "thesis's best": "diamond", "finalist": "circle"}
@@ -156,7 +156,7 @@ def _description(row: Any) -> str:
     tested = row.kind == "finalist"
     error = f"{'test' if tested else 'validation'} error {row.error:.4g}"
     if tested and not math.isnan(row.error_low):
-        error += f" (95 %: {row.error_low:.3g} to {row.error_high:.3g})"
+        error += f" (95 %: {error_interval(row.error_low, row.error_high)})"
     lines = [
         f"<b>{row.name}</b> – {row.group}{'' if row.outcome == 'completed' else f', {row.outcome}'}",
         error,

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from cconv.files import write_text
 from cconv.report.sections import SECTIONS
 from cconv.report.sections.section import Records
+from cconv.report.tables import error_interval
 from cconv.study.records.run_folder import RunFolder
 from cconv.study.records.summary import Summary
 
@@ -52,6 +53,7 @@ def templates() -> Environment:
         trim_blocks=True,
         undefined=StrictUndefined,
     )
+    environment.globals |= {"error_interval": error_interval}
     environment.filters |= {"number": _number, "duration": _duration, "table": _table, "png": _png}
     return environment
 

@@ -8,17 +8,17 @@ from statistics import fmean
 import numpy as np
 import pandas as pd
 
-from cconv.evaluation.statistics import stated_interval
+from cconv.evaluation.statistics import crossed_interval
 from cconv.report.compared_runs import ComparedRun
 from cconv.report.published import published_results
 from cconv.report.tables import MEAN_PREDICTOR, SOLVER
-from cconv.study.records.rollouts import FinalistRollouts, RolledTrajectory
-from cconv.study.records.summary import FinalistEntry
+from cconv.study.records.rollouts import FinalistRollouts
+from cconv.study.records.summary import Errors, FinalistEntry
 
 COLUMNS = (
     "data", "study", "source", "network", "model", "parameters", "ms", "threads", "mse5", "horizon", "error",
-    "ci95_low", "ci95_high", "of_trainings", "seeds", "to_best", "frames", "mse", "mse_low", "mse_high", "ended",
-    "sinkhorn", "e_kin", "updates", "cpu_minutes", "hours", "stable",
+    "ci95_low", "ci95_high", "seeds", "to_best", "frames", "mse", "ended", "sinkhorn", "e_kin", "updates",
+    "cpu_minutes", "hours", "stable",
 )  # fmt: skip
 OURS = "measured"
 
@@ -28,12 +28,11 @@ def scores_table(runs: Sequence[ComparedRun]) -> pd.DataFrame:
 
     Columns: data, the folder's name; study; source, `OURS` or where a published row comes from; network in words and
     model, its id; parameters; ms per frame on so many threads of a CPU, of published rows a forward pass on an A6000;
-    mse5; horizon, the frames behind error; ci95_low and ci95_high, the 95 % interval of error over trainings and parts
-    of the test split, or of_trainings alone, on that very split, where it has too few parts; seeds, its trainings;
-    to_best, error ÷ smallest of the study. Over whole test trajectories: frames, mse with mse_low and mse_high, ended,
-    the earliest frame at which one of the rollouts ended early, sinkhorn, e_kin, the mean squared error of the kinetic
-    energy. What a training took, mean: updates, cpu_minutes of its updates, hours with evaluations. stable. What is not
-    known is NaN.
+    mse5; horizon, the frames behind error; ci95_low and ci95_high, the 95 % interval of error over trainings, all
+    tested by the same rollouts; seeds, its trainings; to_best, error ÷ smallest of the study. Over whole test
+    trajectories: frames, mse, ended, the earliest frame at which one of the rollouts ended early, sinkhorn, e_kin, the
+    mean squared error of the kinetic energy. What a training took, mean: updates, cpu_minutes of its updates, hours
+    with evaluations. stable. What is not known is NaN.
     """
     rows = [row for run in runs if run.summary.task.horizon is not None for row in _of_study(run)]
     return pd.DataFrame(rows, columns=list(COLUMNS))
@@ -72,8 +71,7 @@ def _of_study(run: ComparedRun) -> list[dict]:
 
 def _of_finalist(entry: FinalistEntry, smallest: float) -> dict:
     """Errors of the rollouts of a finalist, its cost, and what its training took."""
-    of_trainings = _interval_of_trainings(entry) if entry.test.ci95 is None else None
-    low, high = entry.test.ci95 or of_trainings or (math.nan, math.nan)
+    low, high = _interval_over_trainings(entry.test)
     cpu = entry.train_cpu_seconds
     return {
         "network": entry.in_words or entry.id,
@@ -85,7 +83,6 @@ def _of_finalist(entry: FinalistEntry, smallest: float) -> dict:
         "error": entry.test.error,
         "ci95_low": low,
         "ci95_high": high,
-        "of_trainings": of_trainings is not None,
         "seeds": len(entry.test.by_seed),
         "to_best": entry.test.error / smallest if smallest else math.nan,
         "updates": entry.updates,
@@ -95,14 +92,14 @@ def _of_finalist(entry: FinalistEntry, smallest: float) -> dict:
     }
 
 
-def _interval_of_trainings(entry: FinalistEntry) -> tuple[float, float] | None:
-    """The interval of the mean error over other trainings, all tested by the same rollouts."""
-    interval, _ = stated_interval(np.array([list(entry.test.by_seed.values())]))
-    return interval
+def _interval_over_trainings(test: Errors) -> tuple[float, float]:
+    """The interval of the mean error over other trainings; NaN for too few, or a closed form."""
+    interval = crossed_interval(np.array([list(test.by_seed.values())]))  # trainings are its units
+    return (math.nan, math.nan) if interval is None else (min(interval[0], test.error), max(interval[1], test.error))
 
 
 def _whole(rollouts: FinalistRollouts | None) -> dict:
-    """Measures over whole trajectories; the errors only if all rollouts reached the last stored frame."""
+    """Means over whole rollouts of all trainings; the errors only if all reached the last stored frame."""
     if rollouts is None or not rollouts.rolled:
         return {} if rollouts is None else {"ended": 1}
     rolled = rollouts.rolled
@@ -110,22 +107,12 @@ def _whole(rollouts: FinalistRollouts | None) -> dict:
     known = {"frames": max(each.stored for each in rolled), "ended": min(early) if early else math.nan}
     if early:
         return known
-    errors = _by_seed(rolled)
-    interval, _ = stated_interval(errors) if len(errors) > 1 else (None, "")  # one training says nothing of others
     sinkhorn = [value for each in rolled for value in each.sinkhorn]
     return known | {
-        "mse": float(errors.mean()),
-        "mse_low": math.nan if interval is None else interval[0],
-        "mse_high": math.nan if interval is None else interval[1],
+        "mse": fmean(fmean(each.mse) for each in rolled),
         "sinkhorn": fmean(sinkhorn) if sinkhorn else math.nan,
         "e_kin": fmean(each.e_kin_error for each in rolled),
     }
-
-
-def _by_seed(rolled: Sequence[RolledTrajectory]) -> np.ndarray:
-    """Mean error of each rollout, (seeds, trajectories)."""
-    seeds = dict.fromkeys(each.seed for each in rolled)
-    return np.array([[fmean(each.mse) for each in rolled if each.seed == seed] for seed in seeds])
 
 
 def _published(row: dict, horizon: int | None) -> dict:

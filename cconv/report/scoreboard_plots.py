@@ -16,7 +16,7 @@ from cconv.report.colors import MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR
 from cconv.report.plots import new_panels
 from cconv.report.published import CHECKPOINTS
 from cconv.report.scoreboard import OURS
-from cconv.report.tables import MEAN_PREDICTOR, SOLVER
+from cconv.report.tables import MEAN_PREDICTOR, SOLVER, has_upper_end
 
 WIDEST_NAME = 38  # characters of a line of the legend
 _MARKERS = "oDs^vP*X"
@@ -26,8 +26,9 @@ _DASHES = {"GNS": ":", "SEGNN": "-."}  # of published networks with checkpoints
 def scoreboard_chart(scores: pd.DataFrame) -> Figure:
     """Error against time per frame, log axes, a panel for each data set; a network looks the same in all of them.
 
-    Bars are 95 % intervals, where there are any. Grey lines are the errors of published checkpoints in rollouts as
-    long, which have no time on a CPU. The dashed line is predicting the mean.
+    Bars are 95 % intervals over trainings, where there are any; one that ends at its point has no upper end. Grey lines
+    are the errors of published checkpoints in rollouts as long, which have no time on a CPU. The dashed line is
+    predicting the mean.
 
     Args:
         scores: A table of `scores_table`, not empty.
@@ -72,10 +73,11 @@ def _draw_scene(axes: Axes, rows: pd.DataFrame, looks: dict[str, list]) -> None:
 
 def _draw_network(axes: Axes, row: Any, color: ColorType, marker: str) -> None:
     has_interval = not math.isnan(row.ci95_low)
+    high = row.ci95_high if has_upper_end(row.ci95_low, row.ci95_high) else row.error
     axes.errorbar(
         row.ms,
         row.error,
-        yerr=[[row.error - row.ci95_low], [row.ci95_high - row.error]] if has_interval else None,
+        yerr=[[row.error - row.ci95_low], [high - row.error]] if has_interval else None,
         fmt=marker,
         color=color,
         ms=8,

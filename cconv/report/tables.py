@@ -12,6 +12,7 @@ from cconv.study.records.summary import FinalistEntry, Summary
 ANALYTIC = "analytic SPH"
 SOLVER = "SPH solver"
 MEAN_PREDICTOR = "predicting the mean"  # of the training split, always and everywhere
+WIDEST = 1e3  # ratio of the ends of an interval of errors from which on its upper end tells nothing
 AUDIT_MEASURES = {"spearman": "rank correlation", "recall": "recall of the best", "regret": "regret"}
 
 
@@ -231,3 +232,17 @@ def _solver_points(summary: Summary) -> list[dict]:
         for point in points
         for group in [SOLVER if point.sound_ratio == points[0].sound_ratio else f"{SOLVER}, slow sound"]
     ]
+
+
+def has_upper_end(low: float, high: float) -> bool:
+    """Tell whether the upper end of an interval of errors says anything.
+
+    A few draws of very different errors, as of trainings some of which blow up, or of windows of a flow that comes to
+    rest, leave errors possible that are larger by any number of decades.
+    """
+    return high <= WIDEST * low
+
+
+def error_interval(low: float, high: float, digits: int = 3) -> str:
+    """Put an interval of errors into words, one without an upper end as "at least ..."."""
+    return f"{low:.{digits}g} to {high:.{digits}g}" if has_upper_end(low, high) else f"at least {low:.{digits}g}"

@@ -11,7 +11,6 @@ from cconv.evaluation.statistics import (
     crossed_standard_error,
     mean_interval,
     paired_ratio,
-    stated_interval,
     times_tie,
     why_no_interval,
 )
@@ -76,15 +75,6 @@ def test_an_interval_of_a_mean_is_positive_holds_it_and_shrinks_to_a_constant(rn
     assert crossed_interval(table) == (low, high)  # seeded
     assert crossed_interval(np.full((4, 4), 0.5)) == pytest.approx((0.5, 0.5))
     assert high / low < np.divide(*crossed_interval(errors(rng, 5, 4))[::-1])
-
-
-def test_an_interval_that_tells_nothing_is_not_stated_but_why(rng):
-    table = errors(rng)
-    assert stated_interval(table) == (crossed_interval(table), "")
-    assert stated_interval(table[:, :3]) == (None, why_no_interval(5, 3))
-    none, why = stated_interval(np.array([[5e-5, 5e-6, 1e-6, 3e-7]]))  # four windows of a flow that comes to rest
-    assert none is None
-    assert "a factor of more than 1000" in why
 
 
 def test_many_units_give_the_interval_of_the_law_of_large_numbers(rng):

@@ -10,6 +10,7 @@ from cconv.report.tables import (
     ANALYTIC,
     MEAN_PREDICTOR,
     curves_table,
+    error_interval,
     finalists_table,
     growth_table,
     importance_table,
@@ -145,3 +146,9 @@ def test_what_notebooks_import_needs_neither_ray_nor_torch():
     code = f"import sys, {imports}; print({{'ray', 'torch'}} & set(sys.modules))"
     finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert finished.stdout.strip() == "set()"
+
+
+def test_an_interval_of_errors_without_an_upper_end_says_so():
+    assert error_interval(1.5e-6, 2e-5) == "1.5e-06 to 2e-05"
+    assert error_interval(3.35e-6, 4.49e9) == "at least 3.35e-06"
+    assert error_interval(0.0, 0.0) == "0 to 0"

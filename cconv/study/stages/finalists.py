@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.objectives import Objective
-from cconv.evaluation.statistics import FEWEST, stated_interval
+from cconv.evaluation.statistics import FEWEST, crossed_interval, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import TrainingConfig
@@ -208,8 +208,8 @@ def evaluate_finalist(
         raise StudyError(
             f"finalist {finalist.id}: its predictions on a split are not finite; leave it out, or train it anew."
         )
-    little = _why_one_says_little(finalist)
-    interval, why = (None, little) if little else stated_interval(units)
+    why = _why_one_says_little(finalist) or why_no_interval(*units.shape)
+    interval = None if why else crossed_interval(units)
     facts = Errors(
         error=mean,
         in_words=objective.in_words(mean),
