@@ -16,7 +16,7 @@ from cconv.report.colors import MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR
 from cconv.report.plots import new_panels
 from cconv.report.published import CHECKPOINTS
 from cconv.report.scoreboard import OURS
-from cconv.report.tables import MEAN_PREDICTOR, SOLVER, has_upper_end
+from cconv.report.tables import MEAN_PREDICTOR, SOLVER, end_of_bar
 
 WIDEST_NAME = 38  # characters of a line of the legend
 _MARKERS = "oDs^vP*X"
@@ -73,7 +73,7 @@ def _draw_scene(axes: Axes, rows: pd.DataFrame, looks: dict[str, list]) -> None:
 
 def _draw_network(axes: Axes, row: Any, color: ColorType, marker: str) -> None:
     has_interval = not math.isnan(row.ci95_low)
-    high = row.ci95_high if has_upper_end(row.ci95_low, row.ci95_high) else row.error
+    high = end_of_bar(row.error, row.ci95_low, row.ci95_high)
     axes.errorbar(
         row.ms,
         row.error,

@@ -15,7 +15,7 @@ from matplotlib.ticker import LogFormatter
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
 from cconv.report.plots import mark_mean_predictor, new_figure
 from cconv.report.published import published_errors
-from cconv.report.tables import ANALYTIC, speed_accuracy_table
+from cconv.report.tables import ANALYTIC, end_of_bar, speed_accuracy_table
 from cconv.study.records.summary import Summary
 
 _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D", 8), "finalist": ("o", 8)}
@@ -24,11 +24,12 @@ _MARKERS = {"recommended": ("*", 17), "baseline": ("s", 9), "thesis's best": ("D
 def speed_accuracy_chart(summary: Summary) -> Figure:
     """Error against time per frame, log axes: finalists, search, front, analytic SPH, the solver that made the data.
 
-    Vertical bars are 95 % intervals over seeds and test units, where there are enough for one; horizontal bars are the
-    quartiles of the timing. The front was found by validation errors; the dashed line is predicting the mean on the
-    test split. Each finalist is named in the margin, at the end of a thin line from its point. Trials of the search
-    have validation errors and mostly estimated times; those that were stopped are hollow. The solver is drawn with
-    coarser ones, which are cheaper. Dotted lines are errors that others published for the same data; they have no time.
+    Vertical bars are 95 % intervals over seeds and test units, where there are enough for one; one that ends at its
+    point has no upper end. Horizontal bars are the quartiles of the timing. The front was found by validation errors;
+    the dashed line is predicting the mean on the test split. Each finalist is named in the margin, at the end of a thin
+    line from its point. Trials of the search have validation errors and mostly estimated times; those that were stopped
+    are hollow. The solver is drawn with coarser ones, which are cheaper. Dotted lines are errors that others published
+    for the same data; they have no time.
     """
     points = speed_accuracy_table(summary)
     finalists = points[points["kind"] == "finalist"].sort_values("error", ascending=False)
@@ -60,7 +61,7 @@ def error_range(points: pd.DataFrame, mean_predictor: float, *published: float) 
     Trials are within it up to ten times the worst finalist.
     """
     finalists = points[points["kind"] == "finalist"]
-    highest = finalists[["error", "error_high"]].max(axis=None)
+    highest = max(end_of_bar(row.error, row.error_low, row.error_high) for row in finalists.itertuples())
     errors = points.loc[points["error"].between(0, 10 * highest, inclusive="neither"), "error"]
     solvers = points.loc[(points["kind"] == "solver") & (points["error"] > 0), "error"]
     lowest = np.nanmin(
@@ -93,11 +94,12 @@ def _draw_finalist(axes: Axes, row: Any) -> None:
     """Draw a finalist with its intervals, given its row of `speed_accuracy_table`."""
     marker, size = _MARKERS[row.group]
     has_interval = not np.isnan(row.error_low)
+    high = end_of_bar(row.error, row.error_low, row.error_high)
     axes.errorbar(
         row.ms,
         row.error,
         xerr=[[max(row.ms - row.ms_low, 0)], [max(row.ms_high - row.ms, 0)]],
-        yerr=[[max(row.error - row.error_low, 0)], [max(row.error_high - row.error, 0)]] if has_interval else None,
+        yerr=[[max(row.error - row.error_low, 0)], [max(high - row.error, 0)]] if has_interval else None,
         fmt=marker,
         markersize=size,
         color=MARKED[row.group],

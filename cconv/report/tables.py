@@ -243,6 +243,11 @@ def has_upper_end(low: float, high: float) -> bool:
     return high <= WIDEST * low
 
 
+def end_of_bar(error: float, low: float, high: float) -> float:
+    """Where the bar of an interval ends in a chart: at its upper end, or at the error if that end says nothing."""
+    return high if has_upper_end(low, high) else error
+
+
 def error_interval(low: float, high: float, digits: int = 3) -> str:
     """Put an interval of errors into words, one without an upper end as "at least ..."."""
     return f"{low:.{digits}g} to {high:.{digits}g}" if has_upper_end(low, high) else f"at least {low:.{digits}g}"

@@ -1,5 +1,6 @@
 """Tables of a run: a row for each thing recorded, and nothing lost."""
 
+import math
 import subprocess
 import sys
 
@@ -10,6 +11,7 @@ from cconv.report.tables import (
     ANALYTIC,
     MEAN_PREDICTOR,
     curves_table,
+    end_of_bar,
     error_interval,
     finalists_table,
     growth_table,
@@ -152,3 +154,5 @@ def test_an_interval_of_errors_without_an_upper_end_says_so():
     assert error_interval(1.5e-6, 2e-5) == "1.5e-06 to 2e-05"
     assert error_interval(3.35e-6, 4.49e9) == "at least 3.35e-06"
     assert error_interval(0.0, 0.0) == "0 to 0"
+    assert end_of_bar(2e-6, 1.5e-6, 2e-5) == 2e-5
+    assert end_of_bar(2e-6, 1.5e-6, 4.49e9) == end_of_bar(2e-6, math.nan, math.nan) == 2e-6
