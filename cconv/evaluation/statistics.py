@@ -93,6 +93,17 @@ def crossed_interval(errors: np.ndarray, *, seed: int = 0) -> tuple[float, float
     return float(low), float(high)
 
 
+def interval_beside(mean: float, errors: np.ndarray) -> tuple[float, float] | None:
+    """Compute `crossed_interval`, widened to hold the mean error that is told beside it, if that is outside.
+
+    Args:
+        mean: The mean error as it is told, e.g. over samples instead of units, or rounded otherwise.
+        errors: As of `crossed_interval`.
+    """
+    interval = crossed_interval(errors)
+    return None if interval is None else (min(interval[0], mean), max(interval[1], mean))
+
+
 def paired_ratio(ours: np.ndarray, reference: np.ndarray) -> PairedRatio:
     """Compare the errors of a model with those of a reference on the same seeds and units.
 

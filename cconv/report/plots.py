@@ -6,7 +6,9 @@ from typing import Any, cast
 import pandas as pd
 import seaborn as sns
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from matplotlib.typing import ColorType
 
 from cconv.report.colors import MARKED, MEAN_COLOR, stage_colors
@@ -193,6 +195,12 @@ def mark_mean_predictor(draw_line: Callable, error: float) -> None:
         error: That error.
     """
     draw_line(error, color=MEAN_COLOR, lw=1.2, ls="--", label=f"{MEAN_PREDICTOR}: {error:.3g}")
+
+
+def label_few_decades(axis: Axis) -> None:
+    """Label a logarithmic axis between the powers of ten too, as it may hold one or none of them."""
+    for set_formatter in (axis.set_major_formatter, axis.set_minor_formatter):
+        set_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
 
 
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:

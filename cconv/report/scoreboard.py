@@ -8,7 +8,7 @@ from statistics import fmean
 import numpy as np
 import pandas as pd
 
-from cconv.evaluation.statistics import crossed_interval
+from cconv.evaluation.statistics import interval_beside
 from cconv.report.compared_runs import ComparedRun
 from cconv.report.published import published_results
 from cconv.report.tables import MEAN_PREDICTOR, SOLVER
@@ -94,8 +94,8 @@ def _of_finalist(entry: FinalistEntry, smallest: float) -> dict:
 
 def _interval_over_trainings(test: Errors) -> tuple[float, float]:
     """The interval of the mean error over other trainings; NaN for too few, or a closed form."""
-    interval = crossed_interval(np.array([list(test.by_seed.values())]))  # trainings are its units
-    return (math.nan, math.nan) if interval is None else (min(interval[0], test.error), max(interval[1], test.error))
+    trainings = np.array([list(test.by_seed.values())])  # they are the units here
+    return interval_beside(test.error, trainings) or (math.nan, math.nan)
 
 
 def _whole(rollouts: FinalistRollouts | None) -> dict:

@@ -9,11 +9,10 @@ import pandas as pd
 import seaborn as sns
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 from matplotlib.typing import ColorType
 
 from cconv.report.colors import MEAN_COLOR, PUBLISHED_COLOR, SOLVER_COLOR
-from cconv.report.plots import new_panels
+from cconv.report.plots import label_few_decades, new_panels
 from cconv.report.published import CHECKPOINTS
 from cconv.report.scoreboard import OURS
 from cconv.report.tables import MEAN_PREDICTOR, SOLVER, end_of_bar
@@ -40,8 +39,7 @@ def scoreboard_chart(scores: pd.DataFrame) -> Figure:
         _draw_scene(axes, rows, looks)
         axes.set_title(str(data), fontsize=10, parse_math=False)
         axes.set(xscale="log", yscale="log", xlabel="time per frame on a CPU [ms]")
-        for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-            which(LogFormatter(minor_thresholds=(1.5, 0.6)))
+        label_few_decades(axes.xaxis)
         axes.set_ylabel(f"MSE{rows['horizon'].iloc[0]} [length²]")
     figure.suptitle("Networks of steps, scene by scene")
     handles, labels = zip(*(axes.get_legend_handles_labels() for axes in panels), strict=True)

@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
 
 from cconv.report.colors import ANALYTIC_COLOR, MARKED, PUBLISHED_COLOR, SOLVER_COLOR, stage_colors
-from cconv.report.plots import mark_mean_predictor, new_figure
+from cconv.report.plots import label_few_decades, mark_mean_predictor, new_figure
 from cconv.report.published import published_errors
 from cconv.report.tables import ANALYTIC, end_of_bar, speed_accuracy_table
 from cconv.study.records.summary import Summary
@@ -47,8 +46,7 @@ def speed_accuracy_chart(summary: Summary) -> Figure:
     mark_mean_predictor(axes.axhline, trivial)
     _draw_analytic(axes, points[points["kind"] == "analytic"])
     _name_in_margin(axes, finalists)
-    for which in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-        which(LogFormatter(minor_thresholds=(1.5, 0.6)))
+    label_few_decades(axes.xaxis)
     threads = summary.finalists[0].cost.threads
     axes.set_title(f"{summary.study}: error against cost ({threads} thread{'s' * (threads > 1)})")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8, frameon=False)

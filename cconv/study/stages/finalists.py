@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 from cconv.errors import DataError, StudyError
 from cconv.evaluation.cost import Cost
 from cconv.evaluation.objectives import Objective
-from cconv.evaluation.statistics import FEWEST, crossed_interval, why_no_interval
+from cconv.evaluation.statistics import FEWEST, interval_beside, why_no_interval
 from cconv.models.checkpoint import load_model, read_card, save_model
 from cconv.models.model import Model
 from cconv.study.declared.configuration import TrainingConfig
@@ -209,12 +209,11 @@ def evaluate_finalist(
             f"finalist {finalist.id}: its predictions on a split are not finite; leave it out, or train it anew."
         )
     why = _why_one_says_little(finalist) or why_no_interval(*units.shape)
-    interval = None if why else crossed_interval(units)
     facts = Errors(
         error=mean,
         in_words=objective.in_words(mean),
         measures={name: _mean_of_seeds([table.measures[name] for table in tables]) for name in objective.measures},
-        ci95=None if interval is None else (min(interval[0], mean), max(interval[1], mean)),
+        ci95=None if why else interval_beside(mean, units),
         why_no_interval=why,
         by_seed=dict(zip([record.id for record in finalist.records], by_seed, strict=True)),
         units=Units(count=units.shape[1], worst=float(units.mean(axis=0).max())),
